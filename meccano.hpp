@@ -18,11 +18,14 @@
 #ifndef MECCANO_HPP
 #define MECCANO_HPP
 
+#include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstdint>
 #include <functional>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace meccano {
@@ -157,9 +160,11 @@ struct Sweep { int number, inverted; double minQ, disp; };
 struct OptimizeOptions {
   double maxDisp = 1e-2;   // Algorithm 2's maxDisp, relative to the node's shortest edge; > 0
   int maxSweeps = 300;     // bound of Algorithm 2's loop; >= 1
-  double power = 6;        // exponent of the sweeps on Σ η^power for the worst elements; 1: none, see optimizeMesh
+  // [§3.7.4 departure] Once valid and converged, the worst 1 % of the elements are lifted by Σ η + (η/η_w)^power.
+  double power = 48;       // [1, 64], 1: none
   bool numericalDerivatives = false;  // §3.7.3: derivatives in u and s by differences, as printed
   double mu = 8e-3;        // h(σ_min) that δ gives, relative to the mean σ; (0, 1)
+  double relaxation = 1.6; // [§3.7.4 departure] first trial step, in Newton steps; [1, 2), 1: as printed
   std::vector<int> fixed = {};   // nodes that stay where they are, besides the corners
   std::vector<int> active = {};  // nodes visited in the first sweep; empty: all
   std::function<void(const Sweep&)> onSweep = nullptr;  // called after each sweep
@@ -169,15 +174,19 @@ struct OptimizeOptions {
 
 struct OptimizeReport {
   int sweeps = 0;         // of all phases
-  double disp = 0;        // last sweep's largest displacement, relative to the node's shortest edge
-  bool converged = false; // disp <= maxDisp before maxSweeps
+  double disp = 0;        // of Algorithm 2's last sweep (before the worst elements), as maxDisp
+  bool converged = false; // valid and disp <= maxDisp before maxSweeps
   int inverted = 0;       // elements with σ <= 0 left
   double minQ = 0, meanQ = 0;
 };
 
+/// [§3.5] How the outline of S_M is healed: by cases 1 and 2, or [departure] by rim regularization with whole
+/// squares, or with half squares too.
+enum class Outline { paper, squares, halfSquares };
+
 struct InsertOptions {
   double lc = 0;              // [eq. (1)] l_c, length unit of the input; > 0 and below dist(∂M, S)
-  bool halfSquares = true;    // [§3.5 departure] rim regularization
+  Outline outline = Outline::halfSquares;  // [§3.5 departure]
   bool followRim = true;      // [§3.6 departure] rim correspondence and anchored equations
   int maxTets = 20000000;     // refuse where more tetrahedra are predicted
   OptimizeOptions optimize;   // §3.7
@@ -216,6 +225,32 @@ Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells);
 ///   errors  MethodError where the mesh is not a bisection of Kuhn cubes
 void bisect(Mesh& M, const std::vector<int>& E);
 
+/// A mesh while it is refined: M with the adjacency that bisection needs, kept up by it.
+struct Bisection {
+  Mesh& M;
+  std::vector<std::array<int, 4>> neighbour;  // [tets], as faceNeighbours
+  std::vector<int> tetOf;                     // [nodes], a tetrahedron at the node
+  std::vector<std::pair<int, int>> splits;    // log: index of the parent (now child 0), of child 1
+
+  explicit Bisection(Mesh& M);
+  /// Kossaczký's method: first neighbours with another refinement edge, then the whole ring at once.
+  void bisect(int E, int depth = 0);
+  /// Bisects tetrahedra at the edge (a, b) until it is split; nothing where there is no such edge.
+  void bisectEdge(int a, int b);
+  /// The tetrahedra around the edge (a, b) of E, E first; those at node n; one with the edge or -1.
+  void ring(int E, int a, int b, std::vector<int>& around) const;
+  void star(int n, std::vector<int>& around) const;
+  int tetWithEdge(int a, int b) const;
+
+  /// Dimension and number (as in Mesh::entity) of what the edge (a, b) lies on.
+  struct EdgeEntity { int dimension, entity; };
+  EdgeEntity entityOf(int a, int b, const std::vector<int>& around) const;
+
+ private:
+  int addMidpoint(int a, int b, const std::vector<int>& around);
+  void bisectRing(const std::vector<int>& around);
+};
+
 /// Neighbour across the face opposite to each vertex, -1 on the boundary. [tets]
 std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M);
 
@@ -234,6 +269,314 @@ Vec3 varphi(const Parametrization& P, const Location& at);
 const Parametrization& surfaceOf(const Mesh& M, int label);
 /// Faces labelled k (S_M of inserted surface k, or boundary patch -k), each once. [faces], node indices
 std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
+
+// ---- 3.1 Problem statement ---------------------------------------------------------------------
+
+/// [§3.1] S as the method needs it: a disk, with one orientation and one rim. Welds exactly
+/// coincident points, drops duplicate and zero-area triangles and unused points, turns triangles
+/// that disagree.
+///   S         any triangle soup; triangles and points are counted from 0 in the messages
+///   warnings  gets one line per kind of repair
+///   errors    InputError: nothing left; an index out of range; a coordinate not finite; a
+///             non-manifold edge or vertex; not orientable; several components; closed; holes; a
+///             handle (χ ≠ 1)
+TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings);
+
+/// Neighbour across edge i (from vertex i to i + 1) of each triangle, -1 on the rim. [triangles]
+///   errors  InputError where three triangles share an edge
+std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S);
+/// The rims of a consistently oriented surface, each a closed loop of points with S on its left.
+std::vector<std::vector<int>> rimLoops(const TriangleSurface& S);
+
+// ---- Tools for 3.2 and 3.4: distance to S ------------------------------------------------------
+
+/// The point of a triangle nearest to a given one, and the feature it lies in the interior of.
+enum class Feature { face, edge, vertex };
+struct ClosestPoint {
+  double distance;
+  Vec3 point;
+  int triangle;     // -1: there is none
+  double w[3];      // barycentric coordinates of point, >= 0, sum 1
+  Feature feature;
+  int which;        // edge from vertex `which` to the next, or vertex; 0 for a face
+};
+/// Nearest point of the triangle abc. Exact to rounding for needles too: the foot inside the
+/// triangle competes with the nearest points of the edges. A segment is a triangle with c = b.
+ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c);
+
+/// Bounding boxes in a binary tree over triangles. Owns copies; building it is O(N log N).
+struct TriangleTree {
+  struct Box { Vec3 lo, hi; };
+  /// A leaf holds triangles first .. first + count; else count = 0, its children self + 1, right.
+  struct Node { Box box; int first, count, right; };
+  std::vector<Node> nodes;                   // depth first
+  std::vector<int> triangle;                 // [triangles], input number, in tree order
+  std::vector<std::array<Vec3, 3>> corners;  // [triangles], in tree order
+
+  TriangleTree() = default;
+  TriangleTree(const std::vector<Vec3>& points, const std::vector<std::array<int, 3>>& triangles);
+
+  /// The nearest point of all triangles; of equally near triangles the one with the lowest number.
+  /// Looks no farther than `within`: the triangle is -1 where nothing is as near.
+  ClosestPoint closest(Vec3 x, double within = 1e300) const;
+  /// Calls found(t) for each triangle whose box meets the closed box [lo, hi], until that is true.
+  template <class Found> void visit(Vec3 lo, Vec3 hi, Found found) const;
+};
+
+inline bool boxesMeet(const TriangleTree::Box& a, Vec3 lo, Vec3 hi) {
+  return a.lo.x <= hi.x && lo.x <= a.hi.x && a.lo.y <= hi.y && lo.y <= a.hi.y && a.lo.z <= hi.z &&
+         lo.z <= a.hi.z;
+}
+
+TriangleTree::Box boxOf(const std::array<Vec3, 3>& corners);
+
+template <class Found> void TriangleTree::visit(Vec3 lo, Vec3 hi, Found found) const {
+  std::vector<int> stack;
+  if (!nodes.empty()) stack.push_back(0);
+  while (!stack.empty()) {
+    int n = stack.back();
+    stack.pop_back();
+    const Node& node = nodes[n];
+    if (!boxesMeet(node.box, lo, hi)) continue;
+    if (node.count == 0) {
+      stack.push_back(node.right);
+      stack.push_back(n + 1);
+    }
+    for (int i = node.first; i < node.first + node.count; ++i) {
+      if (boxesMeet(boxOf(corners[i]), lo, hi) && found(triangle[i])) return;
+    }
+  }
+}
+
+/// What S says about a point of space.
+struct SurfaceQuery {
+  double distance;   // |x - point|
+  Vec3 point;        // nearest point of S, in triangle with barycentric coordinates w
+  int triangle;
+  double w[3];
+  Vec3 normal;       // unit angle-weighted pseudo-normal of the nearest face, edge or vertex
+  double side;       // (x - point) · normal: its sign is the side of S [§3.4]; beyond the rim this
+                     // extends S tangentially
+  bool onRim;        // the nearest feature is an edge or vertex of the rim
+  double excess;     // tangential distance beyond the rim, 0 where not onRim
+};
+
+/// [§3.4] A surface that has passed checkSurface(), ready for distances and sides.
+struct SurfaceDistance {
+  TriangleSurface S;
+  TriangleTree tree;
+  std::vector<int> rim;                    // the rim's points, S on its left
+  TriangleTree rimTree;                    // triangle i is the segment from rim[i] to the next
+  std::vector<Vec3> faceNormal;            // [triangles]
+  std::vector<std::array<Vec3, 3>> edgeNormal;     // [triangles]
+  std::vector<Vec3> vertexNormal;          // [points]
+  std::vector<std::array<int, 3>> neighbours;      // [triangles]
+  std::vector<char> isRimPoint;            // [points]
+
+  explicit SurfaceDistance(const TriangleSurface& cleaned);
+  SurfaceQuery query(Vec3 x) const;
+  double rimDistance(Vec3 x) const;        // distance to the rim polyline
+};
+
+/// Smallest distance of two triangle sets (dist(∂M, S) of eq. (1)) and where; 0 where they cross.
+struct Gap {
+  double distance;
+  int triangle, other;  // of the tree; of `triangles`
+  Vec3 point;           // on the tree's
+};
+Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
+                const std::vector<std::array<int, 3>>& triangles);
+
+/// Two-sided Hausdorff distance, sampled: each triangle at a lattice of samplesPerEdge >= 1 steps.
+double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge);
+
+// ---- Tools for 3.6: sparse iterative solver ----------------------------------------------------
+
+/// A square matrix in compressed rows; columns ascend within a row.
+struct SparseMatrix {
+  std::vector<int> start;      // [rows + 1]
+  std::vector<int> column;     // [entries]
+  std::vector<double> value;   // [entries]
+};
+
+/// Solves A x = b by BiCGSTAB, preconditioned by relaxed ILU(0) (Jacobi where a pivot vanishes).
+///   x          start value on entry, the solution on return
+///   tolerance  of |b - A x| / |b|
+///   returns    the iterations
+///   errors     SolverError, with the residual reached
+int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
+                  double tolerance = 1e-12, int maxIterations = 5000);
+
+// ---- 3.6 Surface projection --------------------------------------------------------------------
+
+/// [§3.6, after 18] tan(α/2) of the angle between a and b: |a×b| / (|a||b| + a·b), or for
+/// obtuse angles its twin (|a||b| − a·b) / |a×b|; finite: α within 1e-8 of π counts as that.
+double tanHalfAngle(Vec3 a, Vec3 b);
+
+/// [§3.6, after 18] Floater's mean value weights λ_ij, positive and of sum 1 in the row of an inner
+/// point i: proportional to (tan(α_{j-1}/2) + tan(α_j/2)) / |x_j − x_i|. Rows of fixed points are
+/// empty.
+SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
+                              const std::vector<std::array<int, 3>>& triangles,
+                              const std::vector<char>& fixed);
+
+/// [§3.6, eq. (3)] Floater's parameterization: rim points keep u, inner ones get u_i = Σ λ_ij u_j.
+///   u       [points], set at the rim (convex loop, counter-clockwise)
+///   errors  SolverError; MethodError where a parametric triangle is not counter-clockwise
+std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
+                                         const std::vector<std::array<int, 3>>& triangles,
+                                         const std::vector<char>& isRim, std::vector<Vec2> u);
+
+/// [§3.6 departure] (1 + μ_i) u_i − Σ λ_ij u_j = μ_i a_i inside pulls u_i to its anchor a_i.
+std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
+                                          const std::vector<char>& isRim, std::vector<Vec2> u,
+                                          const std::vector<double>& mu,
+                                          const std::vector<Vec2>& anchor);
+
+/// Triangles of 𝓤 that are not counter-clockwise.
+std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangles,
+                                  const std::vector<Vec2>& u);
+
+/// [§3.6, case 5 for S itself] Bisects inner edges that join two rim points (the third edge of an
+/// ear is one), which would make ϕ degenerate. Adds points on edges: the geometry of S stays.
+/// Afterwards there are at least four rim points.
+void splitChords(TriangleSurface& S);
+
+/// [§3.6 choice] The four rim points that go to the corners of 𝓤, in order along the rim.
+struct RimCorners {
+  std::array<int, 4> at;      // positions in the rim loop, ascending
+  std::array<bool, 4> sharp;  // a corner of the geometry: its node will stay fixed
+};
+RimCorners rimCorners(const SurfaceDistance& S);
+
+/// [§3.6, eq. (3)] ϕ: 𝓤 → S with its rim as a closed curve that starts at a corner; the four arcs
+/// between the corners go to the four sides of 𝓤 by arc length.
+struct SurfaceParametrization {
+  Parametrization surface;        // S with chords split; without locator
+  Curve rim;                      // sides[0].u at its points; its surface number is not yet set
+  std::array<double, 4> cornerS;  // arc length of the four corners, the first is 0
+  std::array<bool, 4> sharp;
+};
+SurfaceParametrization parametrizeSurface(const SurfaceDistance& S);
+
+struct ProjectionReport {
+  double tangentialShift = 0;     // largest distance of x' from the point of S nearest to x
+  int shiftedNode = -1;           // where
+  int flipped = 0;                // parametric triangles folded by the anchors, before the remedy
+  int rounds = 0;                 // solves of S_M's equations
+  std::vector<int> cornerNodes;   // nodes fixed at sharp corners
+};
+
+/// [§3.6, eq. (3), (4)] Moves the nodes of S_M (faces labelled k = M.surfaces.size() + 1, a disk)
+/// onto S: x' = ϕ(ϕ_M⁻¹(x)). Appends S to M.surfaces, its rim to M.curves, fixed sharp corners to
+/// M.corners, and sets dimension, entity, parameter and x of the nodes.
+///   S          has passed checkSurface()
+///   followRim  [departure] S_M's rim follows the nearest rim of S, and its equations are anchored
+///              (anchoredParametrization); false: plain, and both rims by arc length between four
+///              corners [choice]
+///   errors     MethodError: S_M is no disk or folds in 𝓤; SolverError. M may then be half changed:
+///              work on a copy
+ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& S, bool followRim);
+
+// ==== 3.2 Volumetric approximation ==============================================================
+
+/// Whether the closed triangle meets the closed tetrahedron (relative tolerance 1e-9).
+bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle);
+
+/// [§3.2] r^E: the longest edge of tetrahedron E, length unit of the input. [choice] measured on the
+/// undeformed cubes: on a smoothed mesh one stretched element would ask for a level too many.
+double longestEdge(const Mesh& M, int E);
+/// [§3.2, eq. (1)] r^E >= l_c: the element is to be refined.
+bool isTooLarge(const Mesh& M, int E, double lc);
+
+/// 𝓣: the tetrahedra cut by S, and more; all of at least this level once §3.2 is done.
+struct Approximation {
+  std::vector<char> T;  // [tets], 1: in 𝓣
+  int level = 0;        // a multiple of 3: whole cubes
+};
+/// [§3.2, eq. (1)] Refines the tetrahedra cut by S until none has r^E >= l_c.
+Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc);
+
+// ==== 3.3 Volumetric approximation healing ======================================================
+
+/// [§3.3, eq. (2)] χ = n_E − n_F + n_C of the edges, faces and cells of 𝓣 adjacent to a node: 1 for a local disk.
+int chi(int nE, int nF, int nC);
+/// Eq. (2) at a lattice node with the cubes of 𝓣 around it: bit x + 2 y + 4 z for the cube on the sides x, y, z.
+int chi(unsigned cubes);
+/// Whether these of the eight cubes are connected through faces.
+bool isFaceConnected(unsigned cubes);
+/// [§3.3, eq. (2)] [departure] Eq. (2) and the 2×2×2 rule: cubes inside and outside each face-connected. Two
+/// cubes that share an edge only have χ = 1 at both of its ends and are no manifold; so has a disk with an annulus.
+bool isLocalDisk(unsigned cubes);
+
+/// [§3.3] Adds elements until ∂𝓣 is a surface: whole cubes (faces parallel to the coordinate planes), and
+/// all elements at nodes that are no local disk.
+///   errors  MethodError: 𝓣 grows into the boundary, or does not settle
+void volumetricHealing(Bisection& B, Approximation& A);
+
+// ==== 3.4 Surface extraction ====================================================================
+
+/// A square of ∂𝓣: a face of a cube of 𝓣.
+struct Square {
+  std::array<int, 4> node;        // mesh nodes, counter-clockwise from outside 𝓣
+  std::array<int, 4> across;      // square across the edge from corner e to corner e + 1
+  std::array<int, 4> acrossEdge;  // that edge's number there
+  Vec3 centre;                    // physical
+  int diagonal = 0;               // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
+};
+/// ∂𝓣 as squares, a topological sphere.
+struct SquareSurface {
+  int level = 0;                            // of 𝓣
+  double h = 0;                             // physical edge of a cube
+  std::vector<Square> squares;
+  std::vector<std::uint64_t> keys;          // [squares], place in the computational lattice
+  std::vector<int> nodes;                   // mesh nodes on ∂𝓣
+  std::vector<int> start;                   // [mesh nodes + 1], rows of around
+  std::vector<std::pair<int, int>> around;  // (square, corner) at each node
+};
+/// [§3.3, §3.4] errors: MethodError where ∂𝓣 is no sphere.
+SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
+
+/// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1 and the
+/// centre. 0 nothing, 15 the square; 3, 6, 12, 9 the halves along a diagonal.
+using Selection = std::vector<unsigned char>;
+
+/// S_M as squares, before and after 3.5's work on its outline.
+struct Extraction {
+  Selection selected;
+  double energy = 0;   // what sides are ranked by: rim energy and interior coverage
+  std::string fault;   // why it is no disk; empty: it is one
+};
+/// [§3.4] The squares with all nodes on this side (±1) of S, one disk; then the outline's healing: cases 1
+/// and 2 of §3.5, or [departure] rim regularization, with half squares where asked for.
+Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
+                             Outline outline);
+/// Labels the faces of the selection with surface number k; bisects diagonals where halves need it.
+void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A, const Selection& selected,
+                  int k);
+
+// ==== 3.5 Surface healing =======================================================================
+// Each returns whether it changed anything; done again it changes nothing.
+
+/// [§3.5.1] Removes thin protrusions: squares (pairs of triangles) with three edges on the rim, recursively.
+bool removeThinProtrusions(const SquareSurface& Q, Selection& selected);
+/// [§3.5.2] Adds the square in the plane of the two rim edges at rim nodes with five or more triangles.
+bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected);
+/// [§3.5.3] Refines tetrahedra with more than one face on S_M.
+bool refineTetrahedraWithTwoFaces(Bisection& B, int k);
+/// [§3.5.4] Refines faces with more than one edge on the rim of S_M.
+bool refineFacesWithTwoRimEdges(Bisection& B, int k);
+/// [§3.5.5] Refines inner edges of S_M with both ends on its rim.
+bool refineEdgesAcrossTheRim(Bisection& B, int k);
+/// [§3.5.6] Refines edges that join S_M to another surface or to the boundary.
+bool refineEdgesBetweenSurfaces(Bisection& B, int k);
+/// [§3.5] [departure] S_M must be a full subcomplex: bisects each edge with both ends on S_M that is no edge
+/// of it, and splits each face with three nodes on S_M that is no face of it. Where S is flat such a chord
+/// has zero length to give: the six cases alone left no random surface valid.
+bool refineToFullSubcomplex(Bisection& B, int k);
+/// [§3.5] Cases 3 to 6 and the full subcomplex until nothing changes.
+///   returns rounds;  errors  MethodError after 30
+int surfaceHealing(Bisection& B, int k);
 
 // ==== 3.7 Mesh optimization (optimize.cpp) ======================================================
 // J = Jφ: ideal (computational) element → physical element, both with the vertices in the same order.
@@ -297,7 +640,6 @@ QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal = Ideal::computat
 /// q of each tetrahedron. [tets]
 std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational);
 
-//@insert
 
 // ==== 3. Surface insertion ======================================================================
 

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+# make            ./meccano                     make test    all tests (finds or fetches doctest)
+# make demo       Figure 8, beside Table I      make audit   equation -> function -> test
+# make asan       the tests with sanitizers     make stress  200 random surfaces
+# make bench      time of each stage            make samples samples/ anew from its generator
+CXX      ?= g++
+CXXFLAGS ?= -O2 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-sign-conversion
+EXTRA    ?=
+BUILD    ?= build
+PROGRAM  ?= meccano
+
+COMPILE = $(CXX) -std=c++17 $(CXXFLAGS) $(EXTRA) -ffp-contract=off -pthread
+LIBRARY = $(BUILD)/insert.o $(BUILD)/optimize.o
+TESTS   = $(BUILD)/tests/run.o $(patsubst %.cpp,$(BUILD)/%.o,$(sort $(wildcard tests/test_*.cpp)))
+DEMO    = $(BUILD)/demo
+DOCTEST = $(BUILD)/doctest.flags
+
+all: $(PROGRAM)
+
+$(PROGRAM): $(BUILD)/main.o $(LIBRARY)
+	$(COMPILE) $^ -o $@
+$(BUILD)/%: $(BUILD)/%.o $(LIBRARY)
+	$(COMPILE) $^ -o $@
+$(BUILD)/tests/run: $(TESTS) $(LIBRARY)
+	$(COMPILE) $^ -o $@
+$(BUILD)/%.o: %.cpp
+	@mkdir -p $(@D)
+	$(COMPILE) $$(cat $(DOCTEST) 2>/dev/null) -MMD -MP -c $< -o $@
+$(TESTS): $(DOCTEST)
+
+# <doctest/doctest.h> where the compiler finds it; else Debian's package, installed or unpacked.
+$(DOCTEST):
+	@mkdir -p $(BUILD)
+	@fetch() { "$$@" apt-get install -y -q doctest-dev || \
+	    { "$$@" apt-get update -q && "$$@" apt-get install -y -q doctest-dev; }; }; \
+	if echo '#include <doctest/doctest.h>' | $(CXX) -E -x c++ - >/dev/null 2>&1; then :; \
+	elif ! command -v apt-get >/dev/null; then \
+	  echo 'make test: install doctest 2.4.9 or later so that <doctest/doctest.h> is found'; exit 1; \
+	elif [ "$$(id -u)" = 0 ]; then fetch env; \
+	elif sudo -n true 2>/dev/null; then fetch sudo -n; \
+	else (cd $(BUILD) && apt-get download doctest-dev && dpkg -x doctest-dev_*.deb doctest) && \
+	  echo '-isystem $(BUILD)/doctest/usr/include' > $@; fi && touch $@
+
+test: $(BUILD)/tests/run
+	$(BUILD)/tests/run $(ARGS)
+asan:
+	$(MAKE) test BUILD=$(BUILD)/asan \
+	  CXXFLAGS='-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all'
+
+demo: $(PROGRAM)
+	@mkdir -p $(DEMO)
+	./$(PROGRAM) box --cells 2 2 2 -o $(DEMO)/cube.vtk
+	./$(PROGRAM) insert $(DEMO)/cube.vtk samples/cube_sine/sine.obj --lc .12 \
+	  --stages $(DEMO)/cube_sine -o $(DEMO)/cube_sine.vtk > $(DEMO)/table.txt
+	@awk 'BEGIN { p["Table"] = "paper: original projected smoothed"; p["inverted"] = "0 58 0"; \
+	    p["min"] = "1 0 0.35"; p["max"] = "1 1 0.99"; p["mean"] = "1 0.74 0.92"; \
+	    p["std"] = "0 0.33 0.10" } \
+	  { n = split(p[$$1], c, " "); line = $$0 (n ? "   |" : ""); if (n == 3) line = line "      "; \
+	    for (i = 1; i <= n; ++i) line = line sprintf(" %10s", c[i]); print line }' $(DEMO)/table.txt
+
+samples: $(BUILD)/samples/generate
+	$(BUILD)/samples/generate samples
+audit:
+	@sh tests/audit.sh
+stress bench: %: $(BUILD)/tests/%
+	$(BUILD)/tests/$@ $(ARGS)
+clean:
+	rm -rf $(BUILD) $(PROGRAM)
+
+.PHONY: all demo test audit asan stress bench samples clean
+.SECONDARY:
+-include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d)

@@ -1,0 +1,3765 @@
+// SPDX-License-Identifier: MIT
+//
+// Sections 2 to 3.6 of the paper: the box meccano and Kossaczký's bisection, volumetric approximation
+// and its healing, surface extraction and its healing, surface projection; and insertSurface, which
+// calls them in the paper's order. Section 3.7 is optimize.cpp.
+#include "meccano.hpp"
+
+#include <algorithm>
+#include <cstdint>
+#include <limits>
+#include <numeric>
+#include <set>
+#include <queue>
+
+namespace meccano {
+
+// ==== Tools: numbers and keys ===================================================================
+
+namespace {
+
+constexpr double infinity = std::numeric_limits<double>::infinity();
+
+/// A double as messages print it.
+std::string number(double value) {
+  char text[32];
+  std::snprintf(text, sizeof text, "%.6g", value);
+  return text;
+}
+
+/// Open-addressing hash from 64-bit keys (lattice points, node pairs) to an int, 0 where absent.
+class KeyMap {
+ public:
+  explicit KeyMap(std::size_t expected = 8) {
+    std::size_t size = 16;
+    while (size < 2 * expected) size *= 2;
+    keys_.assign(size, empty);
+    values_.assign(size, 0);
+  }
+  int& operator[](std::uint64_t key) {
+    if (2 * (count_ + 1) > keys_.size()) grow();
+    const std::size_t i = slot(key);
+    if (keys_[i] == empty) {
+      keys_[i] = key;
+      ++count_;
+    }
+    return values_[i];
+  }
+  int get(std::uint64_t key) const {
+    const std::size_t i = slot(key);
+    return keys_[i] == empty ? 0 : values_[i];
+  }
+  std::size_t size() const { return count_; }
+
+ private:
+  static constexpr std::uint64_t empty = ~std::uint64_t(0);
+  std::size_t slot(std::uint64_t key) const {
+    std::uint64_t z = key * 0x9E3779B97F4A7C15u;  // Fibonacci hashing
+    std::size_t i = (z ^ (z >> 29)) & (keys_.size() - 1);
+    while (keys_[i] != empty && keys_[i] != key) i = (i + 1) & (keys_.size() - 1);
+    return i;
+  }
+  void grow() {
+    KeyMap larger(keys_.size());
+    for (std::size_t i = 0; i < keys_.size(); ++i)
+      if (keys_[i] != empty) larger[keys_[i]] = values_[i];
+    *this = std::move(larger);
+  }
+  std::vector<std::uint64_t> keys_;
+  std::vector<int> values_;
+  std::size_t count_ = 0;
+};
+
+std::uint64_t edgeKey(int a, int b) {
+  const std::uint64_t lo = std::uint32_t(std::min(a, b)), hi = std::uint32_t(std::max(a, b));
+  return lo << 32 | hi;
+}
+
+int localIndex(const std::array<int, 4>& tet, int n) {
+  for (int i = 0; i < 4; ++i)
+    if (tet[i] == n) return i;
+  return -1;
+}
+
+}  // namespace
+
+// ==== Tools: curves, and the point location in 𝓤 ================================================
+
+Vec3 gamma(const Curve& C, double s) {
+  const double length = C.s.back();
+  if (C.closed)
+    s -= length * std::floor(s / length);
+  else
+    s = std::clamp(s, 0.0, length);
+  const int last = static_cast<int>(C.s.size()) - 2;
+  const auto after = std::upper_bound(C.s.begin(), C.s.end(), s);
+  const int i = std::clamp(static_cast<int>(after - C.s.begin()) - 1, 0, last);
+  const Vec3 a = C.points[i], b = C.points[(i + 1) % C.points.size()];
+  const double t = C.s[i + 1] > C.s[i] ? (s - C.s[i]) / (C.s[i + 1] - C.s[i]) : 0;
+  return t < .5 ? a + t * (b - a) : b + (1 - t) * (a - b);  // exact at both ends
+}
+
+namespace {
+
+/// u of a surface along a curve that bounds it: as gamma, in 𝓤.
+Vec2 curveParameter(const Curve& C, const Curve::Side& side, double s) {
+  const double length = C.s.back();
+  if (C.closed) s -= length * std::floor(s / length);
+  const int last = static_cast<int>(C.s.size()) - 2;
+  const auto after = std::upper_bound(C.s.begin(), C.s.end(), s);
+  const int i = std::clamp(static_cast<int>(after - C.s.begin()) - 1, 0, last);
+  const Vec2 a = side.u[i], b = side.u[(i + 1) % side.u.size()];
+  const double t = C.s[i + 1] > C.s[i] ? (s - C.s[i]) / (C.s[i + 1] - C.s[i]) : 0;
+  return a + t * (b - a);
+}
+
+/// Cell of the locator's grid along one axis.
+int gridCell(double coordinate, int size) {
+  return std::clamp(static_cast<int>(coordinate * size), 0, size - 1);
+}
+
+/// Range of cells that the triangle's box meets, widened by rounding.
+std::array<int, 4> gridRange(const Parametrization& P, const std::array<int, 3>& t) {
+  constexpr double margin = 1e-9;  // in 𝓤: far above rounding, far below a cell
+  const Vec2 a = P.u[t[0]], b = P.u[t[1]], c = P.u[t[2]];
+  return {gridCell(std::min({a.x, b.x, c.x}) - margin, P.gridSize),
+          gridCell(std::max({a.x, b.x, c.x}) + margin, P.gridSize),
+          gridCell(std::min({a.y, b.y, c.y}) - margin, P.gridSize),
+          gridCell(std::max({a.y, b.y, c.y}) + margin, P.gridSize)};
+}
+
+}  // namespace
+
+void buildLocator(Parametrization& P) {
+  const int count = static_cast<int>(P.triangles.size());
+  P.gridSize = std::clamp(static_cast<int>(std::sqrt(count)), 1, 1024);
+  P.gridStart.assign(P.gridSize * P.gridSize + 1, 0);
+  auto forCells = [&](int t, auto visit) {
+    const std::array<int, 4> r = gridRange(P, P.triangles[t]);
+    for (int j = r[2]; j <= r[3]; ++j)
+      for (int i = r[0]; i <= r[1]; ++i) visit(j * P.gridSize + i);
+  };
+  for (int t = 0; t < count; ++t) forCells(t, [&](int c) { ++P.gridStart[c + 1]; });
+  std::partial_sum(P.gridStart.begin(), P.gridStart.end(), P.gridStart.begin());
+  P.gridTriangles.resize(P.gridStart.back());
+  std::vector<int> next(P.gridStart.begin(), P.gridStart.end() - 1);
+  for (int t = 0; t < count; ++t) forCells(t, [&](int c) { P.gridTriangles[next[c]++] = t; });
+}
+
+Location locate(const Parametrization& P, Vec2 u) {
+  constexpr double tolerance = 1e-9;  // barycentric: a point on the border of 𝓤 may round outside
+  const int cell = gridCell(u.y, P.gridSize) * P.gridSize + gridCell(u.x, P.gridSize);
+  Location best{-1, {0, 0, 0}};
+  double bestInside = -tolerance;
+  for (int i = P.gridStart[cell]; i < P.gridStart[cell + 1]; ++i) {
+    const std::array<int, 3>& t = P.triangles[P.gridTriangles[i]];
+    const Vec2 a = P.u[t[0]] - u, b = P.u[t[1]] - u, c = P.u[t[2]] - u;
+    const double area = cross(b - a, c - a);
+    const double w0 = cross(b, c) / area, w1 = cross(c, a) / area, w2 = 1 - w0 - w1;
+    const double inside = std::min({w0, w1, w2});
+    if (inside > bestInside) {
+      bestInside = inside;
+      best = {P.gridTriangles[i], {w0, w1, w2}};
+    }
+    if (inside >= 0) break;
+  }
+  if (best.triangle >= 0 && bestInside < 0) {
+    double sum = 0;
+    for (double& w : best.w) sum += w = std::max(w, 0.0);
+    for (double& w : best.w) w /= sum;
+  }
+  return best;
+}
+
+Vec3 varphi(const Parametrization& P, const Location& at) {
+  const std::array<int, 3>& t = P.triangles[at.triangle];
+  // From the nearest vertex: exact at the vertices and in coordinate planes.
+  const int i = static_cast<int>(std::max_element(at.w, at.w + 3) - at.w);
+  const int j = (i + 1) % 3, k = (i + 2) % 3;
+  const Vec3 a = P.points[t[i]];
+  return a + (at.w[j] * (P.points[t[j]] - a) + at.w[k] * (P.points[t[k]] - a));
+}
+
+Vec3 varphi(const Parametrization& P, Vec2 u) {
+  const Location at = locate(P, u);
+  if (at.triangle < 0)
+    throw MethodError("varphi (§3.6, eq. (3)): u = (" + number(u.x) + ", " + number(u.y) +
+                      ") is outside the parametric square of surface '" + P.name + "'");
+  return varphi(P, at);
+}
+
+const Parametrization& surfaceOf(const Mesh& M, int label) {
+  return label > 0 ? M.surfaces[label - 1] : M.patches[-label - 1];
+}
+
+std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k) {
+  std::vector<std::array<int, 3>> faces;
+  for (std::size_t E = 0; E < M.faceLabel.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      if (M.faceLabel[E][i] != k) continue;
+      const std::array<int, 4>& z = M.tets[E];
+      // outward for a positively oriented tetrahedron
+      constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+      faces.push_back({z[outward[i][0]], z[outward[i][1]], z[outward[i][2]]});
+    }
+  if (k < 0) return faces;
+  // An inserted face is seen from both of its tetrahedra: keep the first of each pair.
+  std::vector<std::pair<std::array<int, 3>, int>> sorted;
+  for (std::size_t i = 0; i < faces.size(); ++i) {
+    std::array<int, 3> key = faces[i];
+    std::sort(key.begin(), key.end());
+    sorted.push_back({key, static_cast<int>(i)});
+  }
+  std::sort(sorted.begin(), sorted.end());
+  std::vector<int> keep;
+  for (std::size_t i = 0; i < sorted.size(); ++i)
+    if (i == 0 || sorted[i].first != sorted[i - 1].first) keep.push_back(sorted[i].second);
+  std::sort(keep.begin(), keep.end());
+  std::vector<std::array<int, 3>> once;
+  for (int i : keep) once.push_back(faces[i]);
+  return once;
+}
+
+// ==== 2. Meccano: the box ========================================================================
+
+namespace {
+
+/// Patch number of the box side with outward normal -e_axis (side 0) or +e_axis (side 1).
+int boxPatch(int axis, int side) { return 2 * axis + side + 1; }
+
+double component(Vec3 v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+
+Vec3 boxPoint(Vec3 origin, Vec3 size, std::array<int, 3> i, std::array<int, 3> n) {
+  auto at = [](double o, double l, int k, int m) { return k == m ? o + l : o + l * k / m; };
+  return {at(origin.x, size.x, i[0], n[0]), at(origin.y, size.y, i[1], n[1]),
+          at(origin.z, size.z, i[2], n[2])};
+}
+
+/// The six sides as parametrizations of two triangles: u runs along the two other axes.
+void addBoxPatches(Mesh& M, Vec3 origin, Vec3 size) {
+  for (int axis = 0; axis < 3; ++axis)
+    for (int side = 0; side < 2; ++side) {
+      Parametrization P;
+      P.name = std::string(1, "xyz"[axis]) + (side ? "+" : "-");
+      for (int v = 0; v < 2; ++v)
+        for (int u = 0; u < 2; ++u) {
+          std::array<int, 3> corner;
+          corner[axis] = side, corner[(axis + 1) % 3] = u, corner[(axis + 2) % 3] = v;
+          P.points.push_back(boxPoint(origin, size, corner, {1, 1, 1}));
+          P.u.push_back({double(u), double(v)});
+        }
+      P.triangles = {{0, 1, 3}, {0, 3, 2}};
+      buildLocator(P);
+      M.patches.push_back(P);
+    }
+}
+
+/// The twelve edges: along `axis`, at side b of the next axis and side c of the one after.
+void addBoxCurves(Mesh& M, Vec3 origin, Vec3 size) {
+  for (int axis = 0; axis < 3; ++axis)
+    for (int c = 0; c < 2; ++c)
+      for (int b = 0; b < 2; ++b) {
+        Curve C;
+        for (int end = 0; end < 2; ++end) {
+          std::array<int, 3> corner;
+          corner[axis] = end, corner[(axis + 1) % 3] = b, corner[(axis + 2) % 3] = c;
+          C.points.push_back(boxPoint(origin, size, corner, {1, 1, 1}));
+        }
+        C.s = {0, component(size, axis)};
+        // on the side normal to axis + 1, u = (axis + 2, axis); on the one normal to axis + 2, (axis, axis + 1)
+        C.sides = {{-boxPatch((axis + 1) % 3, b), {{double(c), 0}, {double(c), 1}}},
+                   {-boxPatch((axis + 2) % 3, c), {{0, double(b)}, {1, double(b)}}}};
+        M.curves.push_back(C);
+      }
+}
+
+int boxCurve(int axis, int b, int c) { return 4 * axis + 2 * c + b + 1; }
+
+/// Corner number 1 + i + 2 j + 4 k with i, j, k the sides.
+void addBoxCorners(Mesh& M, Vec3 origin, Vec3 size) {
+  for (int number = 0; number < 8; ++number) {
+    const std::array<int, 3> at{number & 1, number >> 1 & 1, number >> 2 & 1};
+    Corner corner{boxPoint(origin, size, at, {1, 1, 1}), {}};
+    for (int axis = 0; axis < 3; ++axis)
+      corner.on.push_back({boxCurve(axis, at[(axis + 1) % 3], at[(axis + 2) % 3]),
+                           at[axis] * component(size, axis)});
+    M.corners.push_back(corner);
+  }
+}
+
+/// Dimension, entity and parameter of the lattice node i of a box with n cells.
+void addBoxNode(Mesh& M, std::array<int, 3> i, std::array<int, 3> n, Vec3 size) {
+  std::array<int, 3> side;  // 0, 1 on the sides, -1 between
+  int between = 0, axis = 0;
+  for (int a = 0; a < 3; ++a) {
+    side[a] = i[a] == 0 ? 0 : i[a] == n[a] ? 1 : -1;
+    between += side[a] < 0;
+  }
+  auto part = [&](int a) { return double(i[a]) / n[a]; };
+  int entity = 0;
+  Vec2 parameter;
+  if (between == 0) entity = 1 + side[0] + 2 * side[1] + 4 * side[2];
+  if (between == 1) {
+    while (side[axis] >= 0) ++axis;
+    entity = boxCurve(axis, side[(axis + 1) % 3], side[(axis + 2) % 3]);
+    parameter = {component(size, axis) * part(axis), 0};
+  }
+  if (between == 2) {
+    while (side[axis] < 0) ++axis;
+    entity = -boxPatch(axis, side[axis]);
+    parameter = {part((axis + 1) % 3), part((axis + 2) % 3)};
+  }
+  M.dimension.push_back(static_cast<unsigned char>(between));
+  M.entity.push_back(entity);
+  M.parameter.push_back(parameter);
+}
+
+/// Six Kuhn tetrahedra of the cell at i: one for each path x0 x1 x2 x3 along the axes.
+void addKuhnCell(Mesh& M, std::array<int, 3> i, std::array<int, 3> n) {
+  auto node = [&](std::array<int, 3> p) { return (p[2] * (n[1] + 1) + p[1]) * (n[0] + 1) + p[0]; };
+  constexpr int paths[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2}, {1, 2, 0}, {2, 0, 1}, {2, 1, 0}};
+  for (const auto& path : paths) {
+    std::array<int, 3> p = i;
+    std::array<int, 4> x;
+    x[0] = node(p);
+    for (int step = 0; step < 3; ++step) {
+      ++p[path[step]];
+      x[step + 1] = node(p);
+    }
+    M.tets.push_back({x[0], x[3], x[2], x[1]});
+    // x0 lies on the lower sides, x3 on the upper ones: the faces without x3 or without x0
+    std::array<int, 4> label{0, 0, 0, 0};
+    if (i[path[0]] + 1 == n[path[0]]) label[0] = -boxPatch(path[0], 1);
+    if (i[path[2]] == 0) label[1] = -boxPatch(path[2], 0);
+    M.faceLabel.push_back(label);
+  }
+}
+
+}  // namespace
+
+Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells) {
+  if (!isFinite(origin) || !isFinite(size) || !(size.x > 0 && size.y > 0 && size.z > 0))
+    throw InputError("boxMesh: origin and size must be finite and size above 0, not size = " +
+                     number(size.x) + " " + number(size.y) + " " + number(size.z));
+  for (int n : cells)
+    if (n < 1 || n > 1000)
+      throw InputError("boxMesh: each number of cells must be from 1 to 1000, not " +
+                       std::to_string(n));
+  Mesh M;
+  addBoxPatches(M, origin, size);
+  addBoxCurves(M, origin, size);
+  addBoxCorners(M, origin, size);
+  for (int k = 0; k <= cells[2]; ++k)
+    for (int j = 0; j <= cells[1]; ++j)
+      for (int i = 0; i <= cells[0]; ++i) {
+        M.x.push_back(boxPoint(origin, size, {i, j, k}, cells));
+        M.xi.push_back({double(i), double(j), double(k)});
+        addBoxNode(M, {i, j, k}, cells, size);
+      }
+  for (int k = 0; k < cells[2]; ++k)
+    for (int j = 0; j < cells[1]; ++j)
+      for (int i = 0; i < cells[0]; ++i) addKuhnCell(M, {i, j, k}, cells);
+  M.type.assign(M.tets.size(), 0);
+  M.level.assign(M.tets.size(), 0);
+  M.cube = {size.x / cells[0], size.y / cells[1], size.z / cells[2]};
+  return M;
+}
+
+// ==== 2. Kossaczký bisection [17] ================================================================
+
+std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
+  const int nodes = static_cast<int>(M.x.size()), count = static_cast<int>(M.tets.size());
+  std::vector<std::array<int, 4>> neighbour(count, {-1, -1, -1, -1});
+  // Faces grouped by their smallest node; within a group equal faces are found by comparing.
+  auto face = [&](int E, int i) {
+    const std::array<int, 4>& z = M.tets[E];
+    std::array<int, 3> v{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
+    std::sort(v.begin(), v.end());
+    return v;
+  };
+  std::vector<int> start(nodes + 1, 0);
+  for (int E = 0; E < count; ++E)
+    for (int i = 0; i < 4; ++i) ++start[face(E, i)[0] + 1];
+  std::partial_sum(start.begin(), start.end(), start.begin());
+  struct Waiting { int v1, v2, E, i; };
+  std::vector<Waiting> group(start.back());
+  std::vector<int> filled(start.begin(), start.end() - 1);
+  for (int E = 0; E < count; ++E)
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 3> v = face(E, i);
+      int g = start[v[0]];
+      while (g < filled[v[0]] && (group[g].v1 != v[1] || group[g].v2 != v[2])) ++g;
+      if (g == filled[v[0]]) {
+        group[filled[v[0]]++] = {v[1], v[2], E, i};
+        continue;
+      }
+      if (neighbour[group[g].E][group[g].i] >= 0)
+        throw InputError("faceNeighbours: the face opposite to vertex " + std::to_string(i) +
+                         " of tetrahedron " + std::to_string(E) + " has more than two tetrahedra");
+      neighbour[group[g].E][group[g].i] = E;
+      neighbour[E][i] = group[g].E;
+    }
+  return neighbour;
+}
+
+Bisection::Bisection(Mesh& mesh) : M(mesh), neighbour(faceNeighbours(mesh)), tetOf(mesh.x.size(), -1) {
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int n : M.tets[E]) tetOf[n] = static_cast<int>(E);
+}
+
+void Bisection::ring(int E, int a, int b, std::vector<int>& around) const {
+  around.assign(1, E);
+  int others[2], found = 0;
+  for (int n : M.tets[E])
+    if (n != a && n != b) others[found++] = n;
+  for (int direction = 0; direction < 2; ++direction) {
+    int t = E, leave = others[direction], keep = others[1 - direction];
+    for (;;) {  // across the face (a, b, keep); ends at E again or at the boundary
+      const int next = neighbour[t][localIndex(M.tets[t], leave)];
+      if (next < 0) break;
+      if (next == E) return;
+      around.push_back(next);
+      int fourth = -1;
+      for (int n : M.tets[next])
+        if (n != a && n != b && n != keep) fourth = n;
+      t = next, leave = keep, keep = fourth;
+    }
+  }
+}
+
+void Bisection::star(int n, std::vector<int>& around) const {
+  around.assign(1, tetOf[n]);
+  for (std::size_t i = 0; i < around.size(); ++i) {
+    const int t = around[i];
+    for (int j = 0; j < 4; ++j) {
+      const int next = neighbour[t][j];
+      if (M.tets[t][j] == n || next < 0) continue;
+      if (std::find(around.begin(), around.end(), next) == around.end()) around.push_back(next);
+    }
+  }
+}
+
+int Bisection::tetWithEdge(int a, int b) const {
+  std::vector<int> around;
+  star(a, around);
+  for (int t : around)
+    if (localIndex(M.tets[t], b) >= 0) return t;
+  return -1;
+}
+
+namespace {
+
+/// u of node n on the surface with this label: its own, or that of its curve or corner there.
+bool parameterOn(const Mesh& M, int n, int label, Vec2& u) {
+  if (M.dimension[n] == 2 && M.entity[n] == label) {
+    u = M.parameter[n];
+    return true;
+  }
+  auto onCurve = [&](int curve, double s) {
+    const Curve& C = M.curves[curve - 1];
+    for (const Curve::Side& side : C.sides)
+      if (side.surface == label) {
+        u = curveParameter(C, side, s);
+        return true;
+      }
+    return false;
+  };
+  if (M.dimension[n] == 1) return onCurve(M.entity[n], M.parameter[n].x);
+  if (M.dimension[n] == 0)
+    for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
+      if (onCurve(place.curve, place.s)) return true;
+  return false;
+}
+
+/// s of node n on curve c.
+bool parameterOnCurve(const Mesh& M, int n, int c, double& s) {
+  if (M.dimension[n] == 1 && M.entity[n] == c) {
+    s = M.parameter[n].x;
+    return true;
+  }
+  if (M.dimension[n] == 0)
+    for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
+      if (place.curve == c) {
+        s = place.s;
+        return true;
+      }
+  return false;
+}
+
+/// Midpoint in s, on a closed curve the shorter way round.
+double curveMidpoint(const Curve& C, double s0, double s1) {
+  const double length = C.s.back();
+  double middle = .5 * (s0 + s1);
+  if (C.closed && std::abs(s1 - s0) > .5 * length) middle += .5 * length;
+  return middle < length ? middle : middle - (C.closed ? length : 0);
+}
+
+/// The curve between the two labels on which both nodes lie; 0 if there is none.
+int commonCurve(const Mesh& M, int a, int b, int label0, int label1) {
+  auto curvesOf = [&](int n) {
+    std::vector<int> curves;
+    if (M.dimension[n] == 1) curves.push_back(M.entity[n]);
+    if (M.dimension[n] == 0)
+      for (const Corner::Place& place : M.corners[M.entity[n] - 1].on) curves.push_back(place.curve);
+    return curves;
+  };
+  const std::vector<int> ofB = curvesOf(b);
+  for (int c : curvesOf(a)) {
+    if (std::find(ofB.begin(), ofB.end(), c) == ofB.end()) continue;
+    bool has0 = false, has1 = false;
+    for (const Curve::Side& side : M.curves[c - 1].sides) {
+      has0 |= side.surface == label0;
+      has1 |= side.surface == label1;
+    }
+    if (has0 && has1) return c;
+  }
+  return 0;
+}
+
+}  // namespace
+
+/// The entity of the edge (a, b), told by the labels of the faces around it: two faces of one surface
+/// (inside it), one face of S_M (its rim), two of different patches (an edge of the boundary).
+Bisection::EdgeEntity Bisection::entityOf(int a, int b, const std::vector<int>& around) const {
+  int patch[2] = {0, 0}, patches = 0, surface = 0, seen = 0;
+  for (int t : around)
+    for (int i = 0; i < 4; ++i) {
+      const int label = M.faceLabel[t][i], n = M.tets[t][i];
+      if (label == 0 || n == a || n == b) continue;
+      if (label < 0 && patches < 2) patch[patches++] = label;
+      if (label > 0) surface = label, ++seen;
+    }
+  if (patches == 2 && patch[0] == patch[1]) return {2, patch[0]};
+  if (patches == 2) return {1, commonCurve(M, a, b, patch[0], patch[1])};
+  if (surface == 0 || surface > static_cast<int>(M.surfaces.size())) return {3, 0};
+  // each face of S_M is seen from both of its tetrahedra
+  return seen >= 4 ? EdgeEntity{2, surface} : EdgeEntity{1, M.surfaces[surface - 1].rim};
+}
+
+int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
+  const EdgeEntity e = entityOf(a, b, around);
+  Vec3 x = .5 * (M.x[a] + M.x[b]);
+  Vec2 parameter;
+  unsigned char dimension = 3;
+  int entity = 0;
+  if (e.dimension == 2) {
+    Vec2 u0, u1;
+    if (parameterOn(M, a, e.entity, u0) && parameterOn(M, b, e.entity, u1)) {
+      dimension = 2, entity = e.entity, parameter = .5 * (u0 + u1);
+      x = varphi(surfaceOf(M, entity), parameter);
+    }
+  } else if (e.dimension == 1 && e.entity > 0) {
+    double s0 = 0, s1 = 0;
+    if (parameterOnCurve(M, a, e.entity, s0) && parameterOnCurve(M, b, e.entity, s1)) {
+      const Curve& C = M.curves[e.entity - 1];
+      dimension = 1, entity = e.entity, parameter = {curveMidpoint(C, s0, s1), 0};
+      x = gamma(C, parameter.x);
+    }
+  }
+  if (e.dimension < 3 && dimension == 3)
+    throw MethodError("bisect (§3.2): the edge of nodes " + std::to_string(a) + " and " +
+                      std::to_string(b) + " lies on a surface, its ends do not; the mesh's entities "
+                      "are inconsistent");
+  M.x.push_back(x);
+  M.xi.push_back(.5 * (M.xi[a] + M.xi[b]));
+  M.dimension.push_back(dimension);
+  M.entity.push_back(entity);
+  M.parameter.push_back(parameter);
+  tetOf.push_back(around[0]);
+  return static_cast<int>(M.x.size()) - 1;
+}
+
+void Bisection::bisectRing(const std::vector<int>& around) {
+  const int a = M.tets[around[0]][0], b = M.tets[around[0]][1];
+  const int m = addMidpoint(a, b, around), first = static_cast<int>(M.tets.size());
+  // The child of ring tetrahedron t at end node `end`: child 0 keeps the index, child 1 is appended.
+  auto child = [&](int t, int end) {
+    if (t < 0 || M.tets[t][0] == end) return t;
+    return first + static_cast<int>(std::find(around.begin(), around.end(), t) - around.begin());
+  };
+  struct Half { std::array<int, 4> z, neighbour, label; };
+  std::vector<Half> halves;
+  for (int t : around) {
+    const std::array<int, 4> z = M.tets[t], N = neighbour[t], L = M.faceLabel[t];
+    const int t1 = child(t, z[1]);
+    halves.push_back({{z[0], z[2], z[3], m},
+                      {t1, child(N[2], z[0]), child(N[3], z[0]), N[1]},
+                      {0, L[2], L[3], L[1]}});
+    Half one{{z[1], z[2], z[3], m},
+             {t, child(N[2], z[1]), child(N[3], z[1]), N[0]},
+             {0, L[2], L[3], L[0]}};
+    if (M.type[t] == 0) {
+      std::swap(one.z[1], one.z[2]);
+      std::swap(one.neighbour[1], one.neighbour[2]);
+      std::swap(one.label[1], one.label[2]);
+    }
+    halves.push_back(one);
+  }
+  for (std::size_t i = 0; i < around.size(); ++i) {
+    const int t = around[i], t1 = first + static_cast<int>(i), beyond = halves[2 * i + 1].neighbour[3];
+    if (beyond >= 0) *std::find(neighbour[beyond].begin(), neighbour[beyond].end(), t) = t1;
+    tetOf[M.tets[t][1]] = t1;
+    M.type[t] = static_cast<unsigned char>((M.type[t] + 1) % 3);
+    ++M.level[t];
+    M.type.push_back(M.type[t]);
+    M.level.push_back(M.level[t]);
+    M.tets.push_back(halves[2 * i + 1].z);
+    neighbour.push_back(halves[2 * i + 1].neighbour);
+    M.faceLabel.push_back(halves[2 * i + 1].label);
+    splits.push_back({t, t1});
+  }
+  for (std::size_t i = 0; i < around.size(); ++i) {
+    const int t = around[i];
+    M.tets[t] = halves[2 * i].z;
+    neighbour[t] = halves[2 * i].neighbour;
+    M.faceLabel[t] = halves[2 * i].label;
+  }
+}
+
+void Bisection::bisect(int E, int depth) {
+  constexpr int maxDepth = 100;  // the recursion descends a level at least every third call
+  if (depth > maxDepth || M.level[E] > 250)
+    throw MethodError("bisect (§3.2): the closure at tetrahedron " + std::to_string(E) +
+                      " does not end; the mesh is no bisection of Kuhn cubes");
+  const int level = M.level[E];
+  std::vector<int> around;
+  while (M.level[E] == level) {
+    const int a = M.tets[E][0], b = M.tets[E][1];
+    ring(E, a, b, around);
+    int coarser = -1;
+    for (int t : around) {
+      const std::array<int, 4>& z = M.tets[t];
+      if (!((z[0] == a && z[1] == b) || (z[0] == b && z[1] == a))) coarser = t;
+    }
+    if (coarser < 0)
+      bisectRing(around);
+    else
+      bisect(coarser, depth + 1);
+  }
+}
+
+void Bisection::bisectEdge(int a, int b) {
+  constexpr int maxRounds = 12;  // an edge of a tetrahedron is its refinement edge after two bisections
+  for (int round = 0; round < maxRounds; ++round) {
+    const int E = tetWithEdge(a, b);
+    if (E < 0) return;
+    bisect(E);
+  }
+  throw MethodError("bisectEdge (§3.5): the edge of nodes " + std::to_string(a) + " and " +
+                    std::to_string(b) + " is not split; the mesh is no bisection of Kuhn cubes");
+}
+
+void bisect(Mesh& M, const std::vector<int>& E) {
+  if (M.xi.size() != M.x.size() || M.level.size() != M.tets.size())
+    throw InputError("bisect (§3.2): the mesh has no computational coordinates; make it by boxMesh");
+  Bisection B(M);
+  std::vector<int> level;
+  for (int t : E) {
+    if (t < 0 || t >= static_cast<int>(M.tets.size()))
+      throw InputError("bisect (§3.2): there is no tetrahedron " + std::to_string(t));
+    level.push_back(M.level[t]);
+  }
+  for (std::size_t i = 0; i < E.size(); ++i)
+    if (M.level[E[i]] == level[i]) B.bisect(E[i]);
+}
+
+// ==== 3.1 Problem statement =====================================================================
+
+namespace {
+
+/// Relative height (height / longest edge) at and below which a triangle counts as one of zero
+/// area: rounding of coordinates moves corners by about 1e-16 of their size, so a smaller height
+/// says nothing.
+constexpr double zeroHeight = 1e-14;
+
+std::string placeText(Vec3 p) {
+  char text[96];
+  std::snprintf(text, sizeof text, "(%.9g, %.9g, %.9g)", p.x, p.y, p.z);
+  return text;
+}
+
+[[noreturn]] void refuseSurface(const std::string& what) {
+  throw InputError("insertSurface (§3.1): " + what);
+}
+
+std::string counted(int n, const char* one, const char* many) {
+  return std::to_string(n) + ' ' + (n == 1 ? one : many);
+}
+
+/// Refuses indices out of range and coordinates that are not finite.
+void checkNumbers(const TriangleSurface& S) {
+  const int points = static_cast<int>(S.points.size());
+  for (int n = 0; n < points; ++n)
+    if (!isFinite(S.points[n]))
+      refuseSurface("point " + std::to_string(n) + " has the coordinates " +
+                    placeText(S.points[n]) + "; all coordinates must be finite numbers");
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t)
+    for (int n : S.triangles[t])
+      if (n < 0 || n >= points)
+        refuseSurface("triangle " + std::to_string(t) + " names point " + std::to_string(n) +
+                      ", but there are " + counted(points, "point", "points") +
+                      " (counted from 0); correct the index");
+}
+
+/// For each point the first one with exactly the same coordinates.
+std::vector<int> firstCoincident(const std::vector<Vec3>& points) {
+  std::vector<int> order(points.size()), first(points.size());
+  for (int n = 0; n < static_cast<int>(order.size()); ++n) order[n] = n;
+  std::sort(order.begin(), order.end(), [&](int a, int b) {
+    const Vec3 &p = points[a], &q = points[b];
+    if (p.x != q.x) return p.x < q.x;
+    if (p.y != q.y) return p.y < q.y;
+    return p.z != q.z ? p.z < q.z : a < b;
+  });
+  for (int i = 0; i < static_cast<int>(order.size()); ++i)
+    first[order[i]] =
+        i > 0 && points[order[i]] == points[order[i - 1]] ? first[order[i - 1]] : order[i];
+  return first;
+}
+
+bool hasZeroArea(Vec3 a, Vec3 b, Vec3 c) {
+  double longest2 = std::max({norm2(b - a), norm2(c - b), norm2(a - c)});
+  return norm(cross(b - a, c - a)) <= zeroHeight * longest2;
+}
+
+/// A surface while it is cleaned: `origin` is the number of each triangle in the user's data.
+struct CleanSurface {
+  TriangleSurface S;
+  std::vector<int> origin;
+};
+
+/// Welds points, drops duplicate and zero-area triangles, then the points nobody uses.
+CleanSurface weldAndDrop(const TriangleSurface& S, std::vector<std::string>& warnings) {
+  std::vector<int> first = firstCoincident(S.points);
+  CleanSurface C;
+  C.S.name = S.name;
+  int duplicates = 0, flat = 0, unused = 0;
+  std::set<std::array<int, 3>> seen;
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
+    std::array<int, 3> v = S.triangles[t];
+    for (int& n : v) n = first[n];
+    std::array<int, 3> key = v;
+    std::sort(key.begin(), key.end());
+    if (hasZeroArea(S.points[v[0]], S.points[v[1]], S.points[v[2]])) ++flat;
+    else if (!seen.insert(key).second) ++duplicates;
+    else {
+      C.S.triangles.push_back(v);
+      C.origin.push_back(t);
+    }
+  }
+  std::vector<int> number(S.points.size(), -1);
+  for (const std::array<int, 3>& v : C.S.triangles)
+    for (int n : v) number[n] = 0;
+  for (int n = 0; n < static_cast<int>(number.size()); ++n) {
+    if (number[n] == 0) {
+      number[n] = static_cast<int>(C.S.points.size());
+      C.S.points.push_back(S.points[n]);
+    } else if (first[n] == n) ++unused;
+  }
+  for (std::array<int, 3>& v : C.S.triangles)
+    for (int& n : v) n = number[n];
+  if (duplicates + flat + unused > 0)
+    warnings.push_back("§3.1: dropped " +
+                       counted(duplicates, "duplicate triangle", "duplicate triangles") + ", " +
+                       counted(flat, "zero-area triangle", "zero-area triangles") + " and " +
+                       counted(unused, "unused point", "unused points"));
+  return C;
+}
+
+/// One triangle's use of an edge: edge i of triangle t, from vertex i to vertex i + 1.
+struct EdgeUse {
+  int a, b, t, i;
+};
+
+/// All uses of edges, those of one edge side by side (a < b; then by triangle).
+std::vector<EdgeUse> sortedEdgeUses(const std::vector<std::array<int, 3>>& triangles) {
+  std::vector<EdgeUse> uses;
+  uses.reserve(3 * triangles.size());
+  for (int t = 0; t < static_cast<int>(triangles.size()); ++t)
+    for (int i = 0; i < 3; ++i) {
+      int a = triangles[t][i], b = triangles[t][(i + 1) % 3];
+      uses.push_back({std::min(a, b), std::max(a, b), t, i});
+    }
+  std::sort(uses.begin(), uses.end(), [](const EdgeUse& p, const EdgeUse& q) {
+    return std::tie(p.a, p.b, p.t, p.i) < std::tie(q.a, q.b, q.t, q.i);
+  });
+  return uses;
+}
+
+std::vector<std::array<int, 3>> neighboursNumbered(const TriangleSurface& S,
+                                                   const std::vector<int>& origin) {
+  std::vector<EdgeUse> uses = sortedEdgeUses(S.triangles);
+  std::vector<std::array<int, 3>> neighbours(S.triangles.size(), {-1, -1, -1});
+  for (size_t k = 0; k + 1 < uses.size(); ++k) {
+    if (uses[k].a != uses[k + 1].a || uses[k].b != uses[k + 1].b) continue;
+    if (k + 2 < uses.size() && uses[k].a == uses[k + 2].a && uses[k].b == uses[k + 2].b)
+      refuseSurface("the edge from " + placeText(S.points[uses[k].a]) + " to " +
+                    placeText(S.points[uses[k].b]) + " is non-manifold: triangles " +
+                    std::to_string(origin[uses[k].t]) + ", " +
+                    std::to_string(origin[uses[k + 1].t]) + " and " +
+                    std::to_string(origin[uses[k + 2].t]) +
+                    " share it; split the surface there into several");
+    neighbours[uses[k].t][uses[k].i] = uses[k + 1].t;
+    neighbours[uses[k + 1].t][uses[k + 1].i] = uses[k].t;
+  }
+  return neighbours;
+}
+
+int cornerOf(const std::array<int, 3>& triangle, int n) {
+  return triangle[0] == n ? 0 : triangle[1] == n ? 1 : triangle[2] == n ? 2 : -1;
+}
+
+/// The triangles at a point, reached from t by crossing edges at the point; marks them.
+void markFan(const TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours, int t,
+             int n, std::vector<std::array<char, 3>>& marked) {
+  std::vector<int> stack{t};
+  while (!stack.empty()) {
+    int s = stack.back(), c = cornerOf(S.triangles[s], n);
+    stack.pop_back();
+    if (marked[s][c]) continue;
+    marked[s][c] = 1;
+    for (int i : {c, (c + 2) % 3})
+      if (neighbours[s][i] >= 0) stack.push_back(neighbours[s][i]);
+  }
+}
+
+/// Refuses points where two fans of triangles meet only there.
+void checkFans(const CleanSurface& C, const std::vector<std::array<int, 3>>& neighbours) {
+  std::vector<std::array<char, 3>> marked(C.S.triangles.size(), {0, 0, 0});
+  std::vector<int> fan(C.S.points.size(), -1);
+  for (int t = 0; t < static_cast<int>(C.S.triangles.size()); ++t)
+    for (int i = 0; i < 3; ++i) {
+      if (marked[t][i]) continue;
+      int n = C.S.triangles[t][i];
+      if (fan[n] >= 0)
+        refuseSurface("the point " + placeText(C.S.points[n]) + " is non-manifold: triangles " +
+                      std::to_string(C.origin[fan[n]]) + " and " + std::to_string(C.origin[t]) +
+                      " meet only there; separate or join the two parts");
+      fan[n] = t;
+      markFan(C.S, neighbours, t, n, marked);
+    }
+}
+
+/// The number of triangles of each edge-connected component.
+std::vector<int> componentSizes(const std::vector<std::array<int, 3>>& neighbours) {
+  std::vector<int> sizes;
+  std::vector<char> seen(neighbours.size(), 0);
+  for (int start = 0; start < static_cast<int>(neighbours.size()); ++start) {
+    if (seen[start]) continue;
+    std::vector<int> stack{start};
+    seen[start] = 1;
+    sizes.push_back(0);
+    while (!stack.empty()) {
+      int t = stack.back();
+      stack.pop_back();
+      ++sizes.back();
+      for (int s : neighbours[t])
+        if (s >= 0 && !seen[s]) {
+          seen[s] = 1;
+          stack.push_back(s);
+        }
+    }
+  }
+  return sizes;
+}
+
+/// The edge of triangle s that is edge i of triangle t, and whether both run along it in opposite
+/// directions.
+struct SharedEdge {
+  int edge;
+  bool opposite;
+};
+SharedEdge sharedEdge(const std::array<int, 3>& t, int i, const std::array<int, 3>& s) {
+  int a = t[i], b = t[(i + 1) % 3];
+  for (int j = 0; j < 3; ++j) {
+    if (s[j] == b && s[(j + 1) % 3] == a) return {j, true};
+    if (s[j] == a && s[(j + 1) % 3] == b) return {j, false};
+  }
+  return {-1, false};
+}
+
+/// Turns triangles until all agree, the minority if there is one; false at a Möbius band (then `at`
+/// is an edge). `turned` gets the number of turned triangles. S is connected.
+bool orientConsistently(TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours,
+                        int& turned, std::array<int, 2>& at) {
+  const int N = static_cast<int>(S.triangles.size());
+  std::vector<signed char> turn(N, -1);
+  std::vector<int> queue{0};
+  turn[0] = 0;
+  for (size_t q = 0; q < queue.size(); ++q) {
+    int t = queue[q];
+    for (int i = 0; i < 3; ++i) {
+      int s = neighbours[t][i];
+      if (s < 0) continue;
+      bool agree = sharedEdge(S.triangles[t], i, S.triangles[s]).opposite;
+      signed char wanted = static_cast<signed char>(agree ? turn[t] : 1 - turn[t]);
+      at = {S.triangles[t][i], S.triangles[t][(i + 1) % 3]};
+      if (turn[s] < 0) {
+        turn[s] = wanted;
+        queue.push_back(s);
+      } else if (turn[s] != wanted) return false;
+    }
+  }
+  int ones = static_cast<int>(std::count(turn.begin(), turn.end(), 1));
+  signed char minority = ones > N / 2 ? 0 : 1;
+  turned = std::min(ones, N - ones);
+  for (int t = 0; t < N; ++t)
+    if (turn[t] == minority) std::swap(S.triangles[t][1], S.triangles[t][2]);
+  return true;
+}
+
+/// Refuses what is no disk: S is connected, manifold and oriented.
+void checkDisk(const TriangleSurface& S) {
+  std::vector<std::vector<int>> rims = rimLoops(S);
+  if (rims.empty())
+    refuseSurface("the surface is closed (" +
+                  counted(static_cast<int>(S.triangles.size()), "triangle", "triangles") +
+                  ", no rim); cut it open or insert a part of it");
+  if (rims.size() > 1) {
+    std::sort(rims.begin(), rims.end(), [](const std::vector<int>& a, const std::vector<int>& b) {
+      return a.size() != b.size() ? a.size() > b.size() : a < b;
+    });
+    refuseSurface("the surface has holes: " + std::to_string(rims.size()) +
+                  " rims, the shortest of " + std::to_string(rims.back().size()) + " edges at " +
+                  placeText(S.points[rims.back()[0]]) + "; fill the holes, one rim must remain");
+  }
+  int edges = static_cast<int>(3 * S.triangles.size() + rims[0].size()) / 2;
+  int chi = static_cast<int>(S.points.size()) - edges + static_cast<int>(S.triangles.size());
+  if (chi != 1)
+    refuseSurface("the surface has " + counted((1 - chi) / 2, "handle", "handles") +
+                  " (Euler characteristic " + std::to_string(chi) +
+                  ", a disk has 1); cut it into disks");
+}
+
+}  // namespace
+
+std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S) {
+  std::vector<int> origin(S.triangles.size());
+  for (int t = 0; t < static_cast<int>(origin.size()); ++t) origin[t] = t;
+  return neighboursNumbered(S, origin);
+}
+
+std::vector<std::vector<int>> rimLoops(const TriangleSurface& S) {
+  std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
+  std::vector<int> next(S.points.size(), -1);
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t)
+    for (int i = 0; i < 3; ++i)
+      if (neighbours[t][i] < 0) next[S.triangles[t][i]] = S.triangles[t][(i + 1) % 3];
+  std::vector<std::vector<int>> loops;
+  for (int start = 0; start < static_cast<int>(next.size()); ++start) {
+    if (next[start] < 0) continue;
+    loops.emplace_back();
+    for (int n = start; n >= 0 && next[n] >= 0;) {
+      loops.back().push_back(n);
+      int after = next[n];
+      next[n] = -1;
+      n = after;
+    }
+  }
+  return loops;
+}
+
+TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings) {
+  checkNumbers(S);
+  CleanSurface C = weldAndDrop(S, warnings);
+  if (C.S.triangles.empty())
+    refuseSurface(S.triangles.empty()
+                      ? "the surface is empty; give at least one triangle"
+                      : "the surface is empty: all its " + std::to_string(S.triangles.size()) +
+                            " triangles have zero area; check its coordinates");
+  std::vector<std::array<int, 3>> neighbours = neighboursNumbered(C.S, C.origin);
+  checkFans(C, neighbours);
+
+  std::vector<int> sizes = componentSizes(neighbours);
+  if (sizes.size() > 1) {
+    std::sort(sizes.rbegin(), sizes.rend());
+    refuseSurface("the surface has " + std::to_string(sizes.size()) +
+                  " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
+                  std::to_string(sizes.back()) + " triangles); insert them one by one");
+  }
+  int turned = 0;
+  std::array<int, 2> at{0, 0};
+  if (!orientConsistently(C.S, neighbours, turned, at))
+    refuseSurface(
+        "the surface is not orientable (a Moebius band): no orientation fits at the edge from " +
+        placeText(C.S.points[at[0]]) + " to " + placeText(C.S.points[at[1]]) + "; cut it open");
+  if (turned > 0)
+    warnings.push_back("§3.1: turned " + counted(turned, "triangle", "triangles") +
+                       " to give the surface a single orientation");
+  checkDisk(C.S);
+  return C.S;
+}
+
+// ---- Tools for 3.2 and 3.4: distance to S ------------------------------------------------------
+
+namespace {
+
+/// Nearest point of the segment ab as ClosestPoint of edge `which`; weights go to slots i and j.
+void keepNearerOnSegment(Vec3 x, Vec3 a, Vec3 b, int i, ClosestPoint& best) {
+  Vec3 d = b - a;
+  double length2 = norm2(d), t = length2 > 0 ? dot(x - a, d) / length2 : 0;
+  t = std::min(std::max(t, 0.0), 1.0);
+  Vec3 p = t < .5 ? a + t * d : b - (1 - t) * d;  // exact at both ends
+  double distance = norm(x - p);
+  if (distance >= best.distance) return;
+  int j = (i + 1) % 3;
+  best.distance = distance;
+  best.point = p;
+  best.w[0] = best.w[1] = best.w[2] = 0;
+  best.w[i] = 1 - t;
+  best.w[j] = t;
+  best.feature = t > 0 && t < 1 ? Feature::edge : Feature::vertex;
+  best.which = t >= 1 ? j : i;
+}
+
+double boxDistance2(const TriangleTree::Box& box, Vec3 x) {
+  Vec3 d{std::max({box.lo.x - x.x, x.x - box.hi.x, 0.0}),
+         std::max({box.lo.y - x.y, x.y - box.hi.y, 0.0}),
+         std::max({box.lo.z - x.z, x.z - box.hi.z, 0.0})};
+  return norm2(d);
+}
+
+double boxDistance2(const TriangleTree::Box& a, const TriangleTree::Box& b) {
+  Vec3 d{std::max({a.lo.x - b.hi.x, b.lo.x - a.hi.x, 0.0}),
+         std::max({a.lo.y - b.hi.y, b.lo.y - a.hi.y, 0.0}),
+         std::max({a.lo.z - b.hi.z, b.lo.z - a.hi.z, 0.0})};
+  return norm2(d);
+}
+
+void growBox(TriangleTree::Box& box, Vec3 p) {
+  box.lo = {std::min(box.lo.x, p.x), std::min(box.lo.y, p.y), std::min(box.lo.z, p.z)};
+  box.hi = {std::max(box.hi.x, p.x), std::max(box.hi.y, p.y), std::max(box.hi.z, p.z)};
+}
+
+constexpr double beyondAll = 1e300;  // beyond every coordinate; its square is not needed
+constexpr int trianglesPerLeaf = 4;
+/// Rounding of distances: a box is skipped only where it is farther by more than this fraction.
+constexpr double boxMargin = 1e-12;
+
+}  // namespace
+
+TriangleTree::Box boxOf(const std::array<Vec3, 3>& corners) {
+  TriangleTree::Box box{corners[0], corners[0]};
+  growBox(box, corners[1]);
+  growBox(box, corners[2]);
+  return box;
+}
+
+namespace {
+
+/// Recursive median split of order[first, last) along the longest side of the centroids' box.
+void buildTreeNode(TriangleTree& tree, const std::vector<std::array<Vec3, 3>>& corners,
+                   const std::vector<Vec3>& centres, std::vector<int>& order, int first, int last) {
+  TriangleTree::Box box = boxOf(corners[order[first]]),
+                    middle{centres[order[first]], centres[order[first]]};
+  for (int i = first; i < last; ++i) {
+    for (const Vec3& p : corners[order[i]]) growBox(box, p);
+    growBox(middle, centres[order[i]]);
+  }
+  const int self = static_cast<int>(tree.nodes.size());
+  tree.nodes.push_back({box, first, last - first, -1});
+  if (last - first <= trianglesPerLeaf) return;
+  Vec3 d = middle.hi - middle.lo;
+  double Vec3::*axis = d.x >= d.y && d.x >= d.z ? &Vec3::x : d.y >= d.z ? &Vec3::y : &Vec3::z;
+  int half = (first + last) / 2;
+  std::nth_element(order.begin() + first, order.begin() + half, order.begin() + last,
+                   [&](int a, int b) {
+                     double p = centres[a].*axis, q = centres[b].*axis;
+                     return p != q ? p < q : a < b;
+                   });
+  tree.nodes[self].count = 0;
+  buildTreeNode(tree, corners, centres, order, first, half);
+  tree.nodes[self].right = static_cast<int>(tree.nodes.size());
+  buildTreeNode(tree, corners, centres, order, half, last);
+}
+
+}  // namespace
+
+ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
+  ClosestPoint best{beyondAll, a, 0, {1, 0, 0}, Feature::vertex, 0};
+  keepNearerOnSegment(x, a, b, 0, best);
+  keepNearerOnSegment(x, b, c, 1, best);
+  keepNearerOnSegment(x, c, a, 2, best);
+
+  // The foot of the perpendicular, where it is inside: w are the areas seen from it.
+  Vec3 n = cross(b - a, c - a);
+  double n2 = norm2(n);
+  if (!(n2 > 0)) return best;
+  double w1 = dot(cross(x - a, c - a), n) / n2, w2 = dot(cross(b - a, x - a), n) / n2,
+         w0 = 1 - w1 - w2;
+  if (!(w0 > 0 && w1 > 0 && w2 > 0)) return best;
+  Vec3 p = a + (w1 * (b - a) + w2 * (c - a));
+  double distance = norm(x - p);
+  if (distance < best.distance) best = {distance, p, 0, {w0, w1, w2}, Feature::face, 0};
+  return best;
+}
+
+TriangleTree::TriangleTree(const std::vector<Vec3>& points,
+                           const std::vector<std::array<int, 3>>& triangles) {
+  const int N = static_cast<int>(triangles.size());
+  std::vector<std::array<Vec3, 3>> all(N);
+  std::vector<Vec3> centres(N);
+  triangle.resize(N);
+  for (int t = 0; t < N; ++t) {
+    for (int i = 0; i < 3; ++i) all[t][i] = points[triangles[t][i]];
+    Box box = boxOf(all[t]);
+    centres[t] = .5 * (box.lo + box.hi);
+    triangle[t] = t;
+  }
+  if (N > 0) buildTreeNode(*this, all, centres, triangle, 0, N);
+  for (int t : triangle) corners.push_back(all[t]);
+}
+
+ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
+  ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
+  struct Entry {
+    int node;
+    double distance;
+  };
+  std::array<Entry, 64>
+      stack;  // depth first, so one entry per level: 64 levels hold 2^64 triangles
+  int top = 0;
+  if (!nodes.empty()) stack[top++] = {0, std::sqrt(boxDistance2(nodes[0].box, x))};
+  while (top > 0) {
+    Entry entry = stack[--top];
+    if (entry.distance > best.distance * (1 + boxMargin)) continue;
+    const Node& node = nodes[entry.node];
+    for (int i = node.first; i < node.first + node.count; ++i) {
+      ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
+      p.triangle = triangle[i];
+      bool lower = p.distance == best.distance && p.triangle < best.triangle;
+      if (p.distance < best.distance || lower) best = p;
+    }
+    if (node.count > 0) continue;
+    Entry left{entry.node + 1, std::sqrt(boxDistance2(nodes[entry.node + 1].box, x))};
+    Entry right{node.right, std::sqrt(boxDistance2(nodes[node.right].box, x))};
+    if (left.distance < right.distance) std::swap(left, right);
+    stack[top++] = left;  // the nearer one is visited first
+    stack[top++] = right;
+  }
+  return best;
+}
+
+namespace {
+
+Vec3 unitVector(Vec3 v) {
+  double length = norm(v);
+  return length > 0 ? (1 / length) * v : v;
+}
+
+double angleOf(Vec3 a, Vec3 b) { return std::atan2(norm(cross(a, b)), dot(a, b)); }
+
+/// Segments of a closed loop as triangles with a double corner.
+TriangleTree loopTree(const std::vector<Vec3>& points, const std::vector<int>& loop) {
+  std::vector<std::array<int, 3>> segments;
+  for (size_t i = 0; i < loop.size(); ++i) {
+    int a = loop[i], b = loop[(i + 1) % loop.size()];
+    segments.push_back({a, b, b});
+  }
+  return TriangleTree(points, segments);
+}
+
+}  // namespace
+
+SurfaceDistance::SurfaceDistance(const TriangleSurface& cleaned)
+    : S(cleaned), tree(S.points, S.triangles), neighbours(triangleNeighbours(S)) {
+  std::vector<std::vector<int>> rims = rimLoops(S);
+  if (rims.size() != 1)
+    throw InputError("SurfaceDistance: the surface has " + std::to_string(rims.size()) +
+                     " rims; call checkSurface() first");
+  rim = rims[0];
+  rimTree = loopTree(S.points, rim);
+  isRimPoint.assign(S.points.size(), 0);
+  for (int n : rim) isRimPoint[n] = 1;
+
+  // Angle-weighted pseudo-normals: their side is right at every nearest point (Baerentzen and
+  // Aanaes 2005).
+  const size_t N = S.triangles.size();
+  faceNormal.resize(N);
+  edgeNormal.resize(N);
+  vertexNormal.assign(S.points.size(), {0, 0, 0});
+  for (size_t t = 0; t < N; ++t) {
+    const std::array<int, 3>& v = S.triangles[t];
+    faceNormal[t] =
+        unitVector(cross(S.points[v[1]] - S.points[v[0]], S.points[v[2]] - S.points[v[0]]));
+    for (int i = 0; i < 3; ++i) {
+      Vec3 a = S.points[v[(i + 1) % 3]] - S.points[v[i]],
+           b = S.points[v[(i + 2) % 3]] - S.points[v[i]];
+      vertexNormal[v[i]] += angleOf(a, b) * faceNormal[t];
+    }
+  }
+  for (size_t t = 0; t < N; ++t)
+    for (int i = 0; i < 3; ++i) {
+      int s = neighbours[t][i];
+      edgeNormal[t][i] = s < 0 ? faceNormal[t] : unitVector(faceNormal[t] + faceNormal[s]);
+    }
+  for (Vec3& n : vertexNormal) n = unitVector(n);
+}
+
+SurfaceQuery SurfaceDistance::query(Vec3 x) const {
+  ClosestPoint p = tree.closest(x);
+  SurfaceQuery q{p.distance, p.point, p.triangle, {p.w[0], p.w[1], p.w[2]}, faceNormal[p.triangle],
+                 0,          false,   0};
+  if (p.feature == Feature::edge) {
+    q.normal = edgeNormal[p.triangle][p.which];
+    q.onRim = neighbours[p.triangle][p.which] < 0;
+  } else if (p.feature == Feature::vertex) {
+    int n = S.triangles[p.triangle][p.which];
+    q.normal = vertexNormal[n];
+    q.onRim = isRimPoint[n] != 0;
+  }
+  Vec3 d = x - q.point;
+  q.side = dot(d, q.normal);
+  if (q.onRim) q.excess = norm(d - q.side * q.normal);
+  return q;
+}
+
+double SurfaceDistance::rimDistance(Vec3 x) const { return rimTree.closest(x).distance; }
+
+namespace {
+
+/// Distance of the segments ab and cd; `on` is the nearest point of ab.
+double segmentDistance(Vec3 a, Vec3 b, Vec3 c, Vec3 d, Vec3& on) {
+  Vec3 u = b - a, v = d - c, r = a - c;
+  double uu = norm2(u), vv = norm2(v), uv = dot(u, v), ur = dot(u, r), vr = dot(v, r),
+         D = uu * vv - uv * uv;
+  double best = beyondAll;
+  auto keep = [&](double s, double t) {
+    Vec3 p = a + s * u, q = c + t * v;
+    if (norm(p - q) < best) {
+      best = norm(p - q);
+      on = p;
+    }
+  };
+  auto clamp = [](double t) { return std::min(std::max(t, 0.0), 1.0); };
+  if (D > 0) {
+    double s = (uv * vr - vv * ur) / D, t = (uu * vr - uv * ur) / D;
+    if (s >= 0 && s <= 1 && t >= 0 && t <= 1) keep(s, t);
+  }
+  for (double s : {0.0, 1.0}) keep(s, vv > 0 ? clamp((vr + s * uv) / vv) : 0);
+  for (double t : {0.0, 1.0}) keep(uu > 0 ? clamp((t * uv - ur) / uu) : 0, t);
+  return best;
+}
+
+/// Whether the segment pq crosses the triangle; `at` is where.
+bool segmentCrosses(Vec3 p, Vec3 q, const std::array<Vec3, 3>& t, Vec3& at) {
+  Vec3 n = cross(t[1] - t[0], t[2] - t[0]);
+  double dp = dot(p - t[0], n), dq = dot(q - t[0], n);
+  if ((dp > 0 && dq > 0) || (dp < 0 && dq < 0) || dp == dq) return false;
+  at = p + (dp / (dp - dq)) * (q - p);
+  for (int i = 0; i < 3; ++i)
+    if (dot(cross(t[(i + 1) % 3] - t[i], at - t[i]), n) < 0) return false;
+  return true;
+}
+
+/// Distance of two triangles and the nearest point of A: corners to faces, edges to edges, or a
+/// crossing.
+double trianglesDistance(const std::array<Vec3, 3>& A, const std::array<Vec3, 3>& B, Vec3& onA) {
+  double best = beyondAll;
+  for (int i = 0; i < 3; ++i) {
+    Vec3 at;
+    bool crossing =
+        segmentCrosses(A[i], A[(i + 1) % 3], B, at) || segmentCrosses(B[i], B[(i + 1) % 3], A, at);
+    if (crossing) {
+      onA = at;
+      return 0;
+    }
+    ClosestPoint p = closestPointOnTriangle(B[i], A[0], A[1], A[2]),
+                 q = closestPointOnTriangle(A[i], B[0], B[1], B[2]);
+    if (p.distance < best) {
+      best = p.distance;
+      onA = p.point;
+    }
+    if (q.distance < best) {
+      best = q.distance;
+      onA = A[i];
+    }
+    for (int j = 0; j < 3; ++j) {
+      double d = segmentDistance(A[i], A[(i + 1) % 3], B[j], B[(j + 1) % 3], at);
+      if (d < best) {
+        best = d;
+        onA = at;
+      }
+    }
+  }
+  return best;
+}
+
+/// Largest distance of sampled points of A from B.
+double sampledDistance(const TriangleTree& A, const TriangleTree& B, int m) {
+  double largest = 0;
+  for (const std::array<Vec3, 3>& c : A.corners)
+    for (int i = 0; i <= m; ++i)
+      for (int j = 0; j <= m - i; ++j) {
+        Vec3 p = (1.0 / m) *
+                 (static_cast<double>(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
+        largest = std::max(largest, B.closest(p).distance);
+      }
+  return largest;
+}
+
+}  // namespace
+
+Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
+                const std::vector<std::array<int, 3>>& triangles) {
+  Gap gap{beyondAll, -1, -1, {}};
+  std::vector<int> stack;
+  for (int o = 0; o < static_cast<int>(triangles.size()) && !tree.nodes.empty(); ++o) {
+    std::array<Vec3, 3> other{points[triangles[o][0]], points[triangles[o][1]],
+                              points[triangles[o][2]]};
+    TriangleTree::Box box = boxOf(other);
+    stack.assign(1, 0);
+    while (!stack.empty()) {
+      int n = stack.back();
+      stack.pop_back();
+      const TriangleTree::Node& node = tree.nodes[n];
+      if (std::sqrt(boxDistance2(node.box, box)) >= gap.distance) continue;
+      if (node.count == 0) {
+        int near = n + 1, far = node.right;
+        if (boxDistance2(tree.nodes[far].box, box) < boxDistance2(tree.nodes[near].box, box))
+          std::swap(near, far);
+        stack.push_back(far);
+        stack.push_back(near);
+      }
+      for (int i = node.first; i < node.first + node.count; ++i) {
+        Vec3 on;
+        double d = trianglesDistance(tree.corners[i], other, on);
+        if (d < gap.distance) gap = {d, tree.triangle[i], o, on};
+      }
+    }
+  }
+  return gap;
+}
+
+double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge) {
+  if (A.nodes.empty() || B.nodes.empty() || samplesPerEdge < 1)
+    throw InputError("hausdorffDistance: give two surfaces with triangles and samplesPerEdge >= 1");
+  return std::max(sampledDistance(A, B, samplesPerEdge), sampledDistance(B, A, samplesPerEdge));
+}
+
+// ---- Tools for 3.6: sparse iterative solver ----------------------------------------------------
+
+namespace {
+
+using RealVector = std::vector<double>;
+
+double innerProduct(const RealVector& a, const RealVector& b) {
+  double sum = 0;
+  for (size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
+  return sum;
+}
+
+double normOf(const RealVector& a) { return std::sqrt(innerProduct(a, a)); }
+
+RealVector productOf(const SparseMatrix& A, const RealVector& x) {
+  RealVector y(x.size());
+  for (size_t i = 0; i < y.size(); ++i) {
+    double sum = 0;
+    for (int k = A.start[i]; k < A.start[i + 1]; ++k) sum += A.value[k] * x[A.column[k]];
+    y[i] = sum;
+  }
+  return y;
+}
+
+/// A pivot below this fraction of its row's largest entry counts as vanished.
+constexpr double smallestPivot = 1e-12;
+
+/// Incomplete factors with the pattern of A: unit lower L and upper U in one matrix, or only the
+/// diagonal.
+struct Preconditioner {
+  SparseMatrix LU;
+  std::vector<int> diagonal;  // entry of each row's pivot
+  RealVector inversePivot;
+  bool jacobi = false;
+};
+
+void useJacobi(Preconditioner& P, const SparseMatrix& A) {
+  P.jacobi = true;
+  for (size_t i = 0; i < P.diagonal.size(); ++i) P.inversePivot[i] = 1 / A.value[P.diagonal[i]];
+}
+
+/// [choice] Share of the fill dropped by ILU(0) that goes to the pivot instead. Near 1 it keeps row
+/// sums, which halves the iterations for long waves; at 1 the pivots of a long chain of points with
+/// row sum 0 vanish.
+constexpr double fillToPivot = .97;
+
+/// Relaxed ILU(0): Gaussian elimination that drops what falls outside the pattern of A.
+Preconditioner incompleteLU(const SparseMatrix& A) {
+  const int n = static_cast<int>(A.start.size()) - 1;
+  Preconditioner P{A, std::vector<int>(n, -1), {}, false};
+  std::vector<int> entry(n, -1);  // entry of the current row in each column
+  RealVector& a = P.LU.value;
+  for (int i = 0; i < n; ++i) {
+    double largest = 0, dropped = 0;
+    for (int k = A.start[i]; k < A.start[i + 1]; ++k) {
+      entry[A.column[k]] = k;
+      if (A.column[k] == i) P.diagonal[i] = k;
+      largest = std::max(largest, std::fabs(A.value[k]));
+    }
+    for (int k = A.start[i]; k < A.start[i + 1] && A.column[k] < i; ++k) {
+      int r = A.column[k];
+      if (P.jacobi) break;
+      a[k] /= a[P.diagonal[r]];
+      for (int l = P.diagonal[r] + 1; l < A.start[r + 1]; ++l) {
+        int at = entry[A.column[l]];
+        (at >= 0 ? a[at] : dropped) -= a[k] * a[l];
+      }
+    }
+    for (int k = A.start[i]; k < A.start[i + 1]; ++k) entry[A.column[k]] = -1;
+    if (P.diagonal[i] < 0 || A.value[P.diagonal[i]] == 0)
+      throw SolverError("solveBiCGSTAB (§3.6): row " + std::to_string(i) +
+                        " has no diagonal entry");
+    a[P.diagonal[i]] += fillToPivot * dropped;
+    if (!(std::fabs(a[P.diagonal[i]]) > smallestPivot * largest)) P.jacobi = true;
+  }
+  for (int d : P.diagonal) P.inversePivot.push_back(1 / P.LU.value[d]);
+  if (P.jacobi) useJacobi(P, A);
+  return P;
+}
+
+RealVector applyPreconditioner(const Preconditioner& P, const RealVector& b) {
+  const SparseMatrix& LU = P.LU;
+  const int n = static_cast<int>(b.size());
+  RealVector y = b;
+  if (P.jacobi) {
+    for (int i = 0; i < n; ++i) y[i] *= P.inversePivot[i];
+    return y;
+  }
+  for (int i = 0; i < n; ++i) {  // L y = b
+    double sum = y[i];
+    for (int k = LU.start[i]; k < P.diagonal[i]; ++k) sum -= LU.value[k] * y[LU.column[k]];
+    y[i] = sum;
+  }
+  for (int i = n - 1; i >= 0; --i) {  // U y = y
+    double sum = y[i];
+    for (int k = P.diagonal[i] + 1; k < LU.start[i + 1]; ++k) sum -= LU.value[k] * y[LU.column[k]];
+    y[i] = sum * P.inversePivot[i];
+  }
+  return y;
+}
+
+RealVector residualOf(const SparseMatrix& A, const RealVector& b, const RealVector& x) {
+  RealVector r = productOf(A, x);
+  for (size_t i = 0; i < r.size(); ++i) r[i] = b[i] - r[i];
+  return r;
+}
+
+/// y += t a
+void addMultiple(RealVector& y, double t, const RealVector& a) {
+  for (size_t i = 0; i < y.size(); ++i) y[i] += t * a[i];
+}
+
+/// BiCGSTAB from x until |r| <= goal, the bound or a breakdown (van der Vorst 1992). Returns the
+/// iterations.
+int bicgstabRun(const SparseMatrix& A, const Preconditioner& P, const RealVector& b, RealVector& x,
+                double goal, int maxIterations) {
+  RealVector r = residualOf(A, b, x), r0 = r, p(r.size(), 0.0), v(r.size(), 0.0);
+  double rho = 1, alpha = 1, omega = 1;
+  for (int iteration = 1; iteration <= maxIterations; ++iteration) {
+    double rhoNew = innerProduct(r0, r), beta = rhoNew / rho * (alpha / omega);
+    if (rhoNew == 0 || !std::isfinite(beta)) return iteration;
+    for (size_t i = 0; i < p.size(); ++i) p[i] = r[i] + beta * (p[i] - omega * v[i]);
+    RealVector pHat = applyPreconditioner(P, p);
+    v = productOf(A, pHat);
+    alpha = rhoNew / innerProduct(r0, v);
+    if (!std::isfinite(alpha)) return iteration;
+    addMultiple(r, -alpha, v);  // r is now s
+    addMultiple(x, alpha, pHat);
+    if (normOf(r) <= goal) return iteration;
+
+    RealVector sHat = applyPreconditioner(P, r), t = productOf(A, sHat);
+    omega = innerProduct(t, r) / innerProduct(t, t);
+    if (!std::isfinite(omega) || omega == 0) return iteration;
+    addMultiple(x, omega, sHat);
+    addMultiple(r, -omega, t);
+    if (normOf(r) <= goal) return iteration;
+    rho = rhoNew;
+  }
+  return maxIterations;
+}
+
+}  // namespace
+
+int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
+                  double tolerance, int maxIterations) {
+  if (b.empty()) return 0;
+  Preconditioner P = incompleteLU(A);
+  const double goal = tolerance * normOf(b);
+  // The recurrence for r drifts from b - A x; each run starts again from the true one. Also after a
+  // breakdown.
+  constexpr int maxRuns = 20;
+  int iterations = 0;
+  for (int run = 0; run < maxRuns && iterations < maxIterations; ++run) {
+    if (normOf(residualOf(A, b, x)) <= goal) return iterations;
+    if (run == maxRuns / 2) useJacobi(P, A);
+    RealVector before = x;
+    iterations += bicgstabRun(A, P, b, x, goal, maxIterations - iterations);
+    if (!std::isfinite(normOf(x))) x = before;
+  }
+  double left = normOf(residualOf(A, b, x));
+  if (left <= goal) return iterations;
+  char text[160];
+  std::snprintf(text, sizeof text,
+                "solveBiCGSTAB (§3.6): relative residual %.3g after %d iterations, wanted %.3g",
+                left / normOf(b), iterations, tolerance);
+  throw SolverError(text);
+}
+
+// ==== 3.6 Surface projection ====================================================================
+
+double tanHalfAngle(Vec3 a, Vec3 b) {
+  constexpr double largestTan = 2e8;  // α within 1e-8 of π, where |a×b| is rounding
+  double sine = norm(cross(a, b)), cosine = dot(a, b), both = norm(a) * norm(b);
+  if (cosine >= 0) return sine / (both + cosine);
+  return sine * largestTan > both - cosine ? (both - cosine) / sine : largestTan;
+}
+
+namespace {
+
+/// Compressed rows from triplets; entries of the same place are added in the order given.
+struct Triplet {
+  int row, column;
+  double value;
+};
+SparseMatrix compressRows(const std::vector<Triplet>& triplets, int rows) {
+  std::vector<int> start(rows + 1, 0);
+  for (const Triplet& t : triplets) ++start[t.row + 1];
+  for (int i = 0; i < rows; ++i) start[i + 1] += start[i];
+  std::vector<int> order(triplets.size()), next(start.begin(), start.end() - 1);
+  for (int k = 0; k < static_cast<int>(triplets.size()); ++k) order[next[triplets[k].row]++] = k;
+
+  SparseMatrix A;
+  A.start.push_back(0);
+  for (int i = 0; i < rows; ++i) {
+    std::stable_sort(order.begin() + start[i], order.begin() + start[i + 1],
+                     [&](int a, int b) { return triplets[a].column < triplets[b].column; });
+    for (int k = start[i]; k < start[i + 1]; ++k) {
+      const Triplet& t = triplets[order[k]];
+      bool same = static_cast<int>(A.column.size()) > A.start[i] && A.column.back() == t.column;
+      if (same) A.value.back() += t.value;
+      else {
+        A.column.push_back(t.column);
+        A.value.push_back(t.value);
+      }
+    }
+    A.start.push_back(static_cast<int>(A.column.size()));
+  }
+  return A;
+}
+
+/// The inner points ring by ring from the rim: an order that suits ILU(0).
+std::vector<int> ringOrder(const SparseMatrix& lambda, const std::vector<char>& isRim) {
+  std::vector<int> order;
+  std::vector<char> seen = isRim;
+  auto add = [&](int n) {
+    if (!seen[n]) order.push_back(n);
+    seen[n] = 1;
+  };
+  for (int n = 0; n < static_cast<int>(isRim.size()); ++n)
+    for (int k = lambda.start[n]; k < lambda.start[n + 1]; ++k)
+      if (isRim[lambda.column[k]]) add(n);
+  for (size_t q = 0; q < order.size(); ++q)
+    for (int k = lambda.start[order[q]]; k < lambda.start[order[q] + 1]; ++k) add(lambda.column[k]);
+  return order;
+}
+
+/// The system of the inner points, (1 + μ_i) u_i − Σ λ_ij u_j, the fixed u_j on the right.
+struct InnerSystem {
+  SparseMatrix A;
+  std::vector<int> point;  // [rows]
+  RealVector b[2], x[2];   // right-hand sides and start values in u and v
+};
+InnerSystem innerSystem(const SparseMatrix& lambda, const std::vector<char>& isRim,
+                        const std::vector<Vec2>& u, const std::vector<double>& mu,
+                        const std::vector<Vec2>& anchor) {
+  InnerSystem I;
+  I.point = ringOrder(lambda, isRim);
+  std::vector<int> row(isRim.size(), -1);
+  for (int r = 0; r < static_cast<int>(I.point.size()); ++r) row[I.point[r]] = r;
+  I.A.start.push_back(0);
+  std::vector<std::pair<int, double>> entries;
+  for (int n : I.point) {
+    entries.assign(1, {row[n], 1 + mu[n]});
+    Vec2 right = mu[n] * anchor[n];
+    for (int k = lambda.start[n]; k < lambda.start[n + 1]; ++k) {
+      int j = lambda.column[k];
+      if (isRim[j]) right = right + lambda.value[k] * u[j];
+      else entries.push_back({row[j], -lambda.value[k]});
+    }
+    std::sort(entries.begin(), entries.end());
+    for (const std::pair<int, double>& e : entries) {
+      I.A.column.push_back(e.first);
+      I.A.value.push_back(e.second);
+    }
+    I.A.start.push_back(static_cast<int>(I.A.column.size()));
+    I.b[0].push_back(right.x);
+    I.b[1].push_back(right.y);
+    I.x[0].push_back(u[n].x);
+    I.x[1].push_back(u[n].y);
+  }
+  return I;
+}
+
+/// Gauss-Seidel sweeps on u_i += Σ λ_ij (u_j − u_i), which keep the differences of neighbours
+/// exact: parametric triangles of long limbs are smaller than a residual of 1e-12 resolves.
+void polishParameters(const SparseMatrix& lambda, const std::vector<char>& isRim,
+                      std::vector<Vec2>& u) {
+  constexpr int sweeps = 100;
+  const int n = static_cast<int>(isRim.size());
+  for (int sweep = 0; sweep < sweeps; ++sweep)
+    for (int m = 0; m < n; ++m) {
+      int i = sweep % 2 == 0 ? m : n - 1 - m;
+      if (isRim[i]) continue;
+      Vec2 d{0, 0};
+      for (int k = lambda.start[i]; k < lambda.start[i + 1]; ++k)
+        d = d + lambda.value[k] * (u[lambda.column[k]] - u[i]);
+      u[i] = u[i] + d;
+    }
+}
+
+/// [§3.6] The message of a map that is not injective.
+[[noreturn]] void refuseFolding(const char* which, size_t flipped, Vec3 at) {
+  throw MethodError(std::string("insertSurface (§3.6): ") + which +
+                    " is self-folding in parameter space: " + std::to_string(flipped) +
+                    " parametric triangles are not counter-clockwise, the first at " +
+                    placeText(at) +
+                    "; remesh the surface there with better triangles, or lower l_c");
+}
+
+}  // namespace
+
+SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
+                              const std::vector<std::array<int, 3>>& triangles,
+                              const std::vector<char>& fixed) {
+  std::vector<Triplet> triplets;
+  triplets.reserve(6 * triangles.size());
+  for (const std::array<int, 3>& t : triangles)
+    for (int c = 0; c < 3; ++c) {
+      int i = t[c], j = t[(c + 1) % 3], k = t[(c + 2) % 3];
+      if (fixed[i]) continue;
+      Vec3 a = points[j] - points[i], b = points[k] - points[i];
+      double tangent = tanHalfAngle(a, b);  // tan(α/2) of the angle jik, for both of its sides
+      triplets.push_back({i, j, tangent / norm(a)});
+      triplets.push_back({i, k, tangent / norm(b)});
+    }
+  SparseMatrix lambda = compressRows(triplets, static_cast<int>(points.size()));
+  for (size_t i = 0; i < points.size(); ++i) {
+    double sum = 0;
+    for (int k = lambda.start[i]; k < lambda.start[i + 1]; ++k) sum += lambda.value[k];
+    for (int k = lambda.start[i]; k < lambda.start[i + 1]; ++k)
+      lambda.value[k] /= sum;  // Σ_j λ_ij = 1
+  }
+  return lambda;
+}
+
+std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
+                                          const std::vector<char>& isRim, std::vector<Vec2> u,
+                                          const std::vector<double>& mu,
+                                          const std::vector<Vec2>& anchor) {
+  InnerSystem I = innerSystem(lambda, isRim, u, mu, anchor);
+  for (int c = 0; c < 2; ++c) solveBiCGSTAB(I.A, I.b[c], I.x[c]);
+  for (size_t i = 0; i < I.point.size(); ++i) u[I.point[i]] = {I.x[0][i], I.x[1][i]};
+  return u;
+}
+
+std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangles,
+                                  const std::vector<Vec2>& u) {
+  std::vector<int> flipped;
+  for (int t = 0; t < static_cast<int>(triangles.size()); ++t) {
+    const std::array<int, 3>& v = triangles[t];
+    if (!(cross(u[v[1]] - u[v[0]], u[v[2]] - u[v[0]]) > 0)) flipped.push_back(t);
+  }
+  return flipped;
+}
+
+std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
+                                         const std::vector<std::array<int, 3>>& triangles,
+                                         const std::vector<char>& isRim, std::vector<Vec2> u) {
+  SparseMatrix lambda = meanValueWeights(points, triangles, isRim);
+  for (size_t i = 0; i < u.size(); ++i)
+    if (!isRim[i]) u[i] = {.5, .5};
+  u = anchoredParametrization(lambda, isRim, u, std::vector<double>(u.size(), 0.0), u);
+  std::vector<int> flipped = flippedTriangles(triangles, u);
+  constexpr int polishes = 5;
+  for (int round = 0; round < polishes && !flipped.empty(); ++round) {
+    polishParameters(lambda, isRim, u);
+    flipped = flippedTriangles(triangles, u);
+  }
+  if (!flipped.empty())
+    refuseFolding("Floater's map", flipped.size(), points[triangles[flipped[0]][0]]);
+  return u;
+}
+
+namespace {
+
+/// Bisects edge i of triangle t, and of its neighbour: the halves keep the orientation.
+void splitSurfaceEdge(TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours, int t,
+                      int i) {
+  std::array<int, 3> T = S.triangles[t];
+  int a = T[i], b = T[(i + 1) % 3], c = T[(i + 2) % 3], s = neighbours[t][i];
+  int m = static_cast<int>(S.points.size());
+  S.points.push_back(.5 * (S.points[a] + S.points[b]));
+  S.triangles[t] = {a, m, c};
+  S.triangles.push_back({m, b, c});
+  if (s < 0) return;
+  int j = sharedEdge(T, i, S.triangles[s]).edge, d = S.triangles[s][(j + 2) % 3];
+  S.triangles[s] = {b, m, d};
+  S.triangles.push_back({m, a, d});
+}
+
+/// Triangle and edge of a rim's longest edge.
+std::array<int, 2> longestRimEdge(const TriangleSurface& S,
+                                  const std::vector<std::array<int, 3>>& neighbours) {
+  std::array<int, 2> at{-1, -1};
+  double longest = -1;
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t)
+    for (int i = 0; i < 3; ++i) {
+      double l = norm(S.points[S.triangles[t][(i + 1) % 3]] - S.points[S.triangles[t][i]]);
+      if (neighbours[t][i] < 0 && l > longest) {
+        longest = l;
+        at = {t, i};
+      }
+    }
+  return at;
+}
+
+/// Bisects chords, no two of them in one triangle; returns how many.
+int splitChordsOnce(TriangleSurface& S) {
+  std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
+  const int N = static_cast<int>(S.triangles.size());
+  std::vector<char> isRim(S.points.size(), 0), touched(N, 0);
+  for (int t = 0; t < N; ++t)
+    for (int i = 0; i < 3; ++i)
+      if (neighbours[t][i] < 0) isRim[S.triangles[t][i]] = isRim[S.triangles[t][(i + 1) % 3]] = 1;
+  int split = 0;
+  for (int t = 0; t < N; ++t)
+    for (int i = 0; i < 3 && !touched[t]; ++i) {
+      int s = neighbours[t][i], a = S.triangles[t][i], b = S.triangles[t][(i + 1) % 3];
+      if (s < 0 || touched[s] || !isRim[a] || !isRim[b]) continue;
+      touched[t] = touched[s] = 1;
+      splitSurfaceEdge(S, neighbours, t, i);
+      ++split;
+    }
+  return split;
+}
+
+}  // namespace
+
+void splitChords(TriangleSurface& S) {
+  std::vector<std::vector<int>> rims = rimLoops(S);
+  if (!rims.empty() && rims[0].size() < 4) {  // a single triangle, or three around a point
+    std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
+    std::array<int, 2> at = longestRimEdge(S, neighbours);
+    splitSurfaceEdge(S, neighbours, at[0], at[1]);
+  }
+  // A split makes no new chord (its point is inside), so each triangle is visited at most thrice.
+  constexpr int rounds = 8;
+  for (int round = 0; round < rounds && splitChordsOnce(S) > 0; ++round) {
+  }
+}
+
+namespace {
+
+constexpr double piValue = 3.14159265358979323846;
+/// [choice] Window on either side of a rim point over which the rim's turning is measured, of the
+/// rim's length: wider than the noise of real rims, narrower than the sides of all but very thin
+/// surfaces.
+constexpr double cornerWindow = .03;
+/// [choice] A second look over a third of it tells a corner from a strong curve.
+constexpr double narrowWindow = .01;
+/// [choice] Least distance of two corners along the rim, of its length; for turns that are not
+/// sharp the second, lest a rounded corner counts twice.
+constexpr double cornerSpacing = .02, weakSpacing = .08;
+/// [choice] Turns that make a corner of 𝓤, and a sharp corner of the geometry (over both windows).
+constexpr double cornerTurn = 30 * piValue / 180;
+constexpr double sharpTurn = 45 * piValue / 180, sharpTurnNarrow = 35 * piValue / 180;
+
+/// Arc length at the points of a closed polyline; one more entry, the length.
+std::vector<double> loopArcLength(const std::vector<Vec3>& points) {
+  std::vector<double> s{0};
+  for (size_t i = 0; i < points.size(); ++i)
+    s.push_back(s.back() + norm(points[(i + 1) % points.size()] - points[i]));
+  return s;
+}
+
+Curve closedCurve(std::vector<Vec3> points) {
+  Curve C;
+  C.s = loopArcLength(points);
+  C.points = std::move(points);
+  C.closed = true;
+  return C;
+}
+
+double periodicArc(double s, double L) { return s - L * std::floor(s / L); }
+
+/// Signed distance along the rim from a to b, in (-L/2, L/2].
+double arcFrom(double a, double b, double L) {
+  double d = periodicArc(b - a, L);
+  return d > L / 2 ? d - L : d;
+}
+
+/// Turn of the rim at arc length s between chords of length w, about `normal`; > 0 where S is
+/// convex.
+double rimTurn(const Curve& rim, double s, double w, Vec3 normal) {
+  Vec3 p = gamma(rim, s), in = p - gamma(rim, s - w), out = gamma(rim, s + w) - p;
+  in = in - dot(in, normal) * normal;
+  out = out - dot(out, normal) * normal;
+  return std::atan2(dot(cross(in, out), normal), dot(in, out));
+}
+
+/// Whether no point within cornerSpacing turns more: beside a corner the window still sees a part
+/// of its turn.
+bool isPeak(const std::vector<double>& s, const std::vector<double>& turn, int i) {
+  const int n = static_cast<int>(turn.size());
+  for (int step : {1, n - 1})
+    for (int j = (i + step) % n;
+         j != i && std::fabs(arcFrom(s[i], s[j], s.back())) < cornerSpacing * s.back();
+         j = (j + step) % n)
+      if (turn[j] > turn[i]) return false;
+  return true;
+}
+
+/// The next corner: the strongest peak that is far from the others, else a point near the middle of
+/// the longest arc without a corner.
+int nextCorner(const std::vector<double>& s, const std::vector<double>& turn,
+               const std::vector<int>& chosen) {
+  const double L = s.back();
+  const int n = static_cast<int>(turn.size());
+  int best = -1;
+  for (int i = 0; i < n; ++i) {
+    if (turn[i] < cornerTurn || (best >= 0 && turn[i] <= turn[best])) continue;
+    bool free = true;
+    double spacing = (turn[i] > sharpTurn ? cornerSpacing : weakSpacing) * L;
+    for (int c : chosen) free = free && std::fabs(arcFrom(s[c], s[i], L)) >= spacing;
+    if (free && isPeak(s, turn, i)) best = i;
+  }
+  if (best >= 0) return best;
+  if (chosen.empty())
+    return static_cast<int>(std::max_element(turn.begin(), turn.end()) - turn.begin());
+  double from = 0, longest = -1;
+  for (int c : chosen) {
+    double arc = L;
+    for (int d : chosen)
+      if (d != c) arc = std::min(arc, periodicArc(s[d] - s[c], L));
+    if (arc > longest) {
+      longest = arc;
+      from = s[c];
+    }
+  }
+  double middle = from + longest / 2;
+  for (int i = 0; i < n; ++i) {
+    if (std::find(chosen.begin(), chosen.end(), i) != chosen.end()) continue;
+    if (best < 0 || std::fabs(arcFrom(middle, s[i], L)) < std::fabs(arcFrom(middle, s[best], L)))
+      best = i;
+  }
+  return best;
+}
+
+std::vector<Vec3> pointsOf(const std::vector<Vec3>& x, const std::vector<int>& nodes) {
+  std::vector<Vec3> points;
+  for (int n : nodes) points.push_back(x[n]);
+  return points;
+}
+
+}  // namespace
+
+RimCorners rimCorners(const SurfaceDistance& S) {
+  const int n = static_cast<int>(S.rim.size());
+  if (n < 4)
+    throw MethodError(
+        "rimCorners (§3.6): the rim has fewer than four points; call splitChords() first");
+  Curve rim = closedCurve(pointsOf(S.S.points, S.rim));
+  const double L = rim.s.back();
+  std::vector<double> turn(n);
+  for (int i = 0; i < n; ++i)
+    turn[i] = rimTurn(rim, rim.s[i], cornerWindow * L, S.vertexNormal[S.rim[i]]);
+  std::vector<int> chosen;
+  for (int c = 0; c < 4; ++c) chosen.push_back(nextCorner(rim.s, turn, chosen));
+  std::sort(chosen.begin(), chosen.end());
+
+  RimCorners corners{};
+  for (int c = 0; c < 4; ++c) {
+    int i = chosen[c];
+    double narrow = rimTurn(rim, rim.s[i], narrowWindow * L, S.vertexNormal[S.rim[i]]);
+    corners.at[c] = i;
+    corners.sharp[c] = turn[i] > sharpTurn && narrow > sharpTurnNarrow;
+  }
+  return corners;
+}
+
+namespace {
+
+/// The point of the boundary of 𝓤 on side 0 .. 3 at the fraction t of the side; on it exactly.
+Vec2 onSide(int side, double t) {
+  switch (side) {
+    case 0:
+      return {t, 0};
+    case 1:
+      return {1, t};
+    case 2:
+      return {1 - t, 1};
+    default:
+      return {0, 1 - t};
+  }
+}
+
+/// Arcs of a closed curve from corner to corner go to the sides of 𝓤 by arc length; s in [0, L).
+Vec2 rimParameter(const std::array<double, 4>& cornerS, double L, double s) {
+  int side = s < cornerS[1] ? 0 : s < cornerS[2] ? 1 : s < cornerS[3] ? 2 : 3;
+  double from = cornerS[side], to = side < 3 ? cornerS[side + 1] : L;
+  return onSide(side, std::min(std::max((s - from) / (to - from), 0.0), 1.0));
+}
+
+}  // namespace
+
+SurfaceParametrization parametrizeSurface(const SurfaceDistance& S) {
+  RimCorners corners = rimCorners(S);
+  std::vector<int> loop = S.rim;
+  std::rotate(loop.begin(), loop.begin() + corners.at[0], loop.end());
+  SurfaceParametrization Phi;
+  Phi.rim = closedCurve(pointsOf(S.S.points, loop));
+  Phi.sharp = corners.sharp;
+  for (int c = 0; c < 4; ++c) Phi.cornerS[c] = Phi.rim.s[corners.at[c] - corners.at[0]];
+
+  std::vector<Vec2> u(S.S.points.size()), uRim;
+  for (size_t i = 0; i < loop.size(); ++i) {
+    uRim.push_back(rimParameter(Phi.cornerS, Phi.rim.s.back(), Phi.rim.s[i]));
+    u[loop[i]] = uRim.back();
+  }
+  Phi.rim.sides.push_back({0, uRim});
+  Phi.surface.points = S.S.points;
+  Phi.surface.triangles = S.S.triangles;
+  Phi.surface.name = S.S.name;
+  Phi.surface.u = floaterParametrization(S.S.points, S.S.triangles, S.isRimPoint, u);
+  return Phi;
+}
+
+namespace {
+
+/// S_M with its own numbers: a disk oriented like S.
+struct ApproximatingSurface {
+  TriangleSurface S;        // points are the nodes' positions
+  std::vector<int> node;    // [points], number in M
+  std::vector<int> rim;     // loop of points, S_M on its left
+  std::vector<char> isRim;  // [points]
+  double h = 0;             // mean length of its edges
+};
+
+ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDistance& S) {
+  ApproximatingSurface SM;
+  std::vector<int> number(M.x.size(), -1);
+  for (std::array<int, 3> f : surfaceFaces(M, k)) {
+    for (int& n : f) {
+      if (number[n] < 0) {
+        number[n] = static_cast<int>(SM.node.size());
+        SM.node.push_back(n);
+        SM.S.points.push_back(M.x[n]);
+      }
+      n = number[n];
+    }
+    SM.S.triangles.push_back(f);
+  }
+  auto refuseSM = [&](const std::string& what) {
+    throw MethodError("insertSurface (§3.6): S_M " + what + "; lower l_c");
+  };
+  if (SM.S.triangles.empty()) refuseSM("of surface " + std::to_string(k) + " has no face");
+  std::vector<std::array<int, 3>> neighbours = triangleNeighbours(SM.S);
+  int turned = 0;
+  std::array<int, 2> at{0, 0};
+  if (componentSizes(neighbours).size() != 1 || !orientConsistently(SM.S, neighbours, turned, at))
+    refuseSM("is not one orientable piece");
+
+  // The side of S's normals: by the nearest points of S, weighted by area.
+  double agreement = 0;
+  for (const std::array<int, 3>& t : SM.S.triangles) {
+    Vec3 a = SM.S.points[t[0]], b = SM.S.points[t[1]], c = SM.S.points[t[2]];
+    agreement += dot(cross(b - a, c - a), S.query((1.0 / 3) * (a + b + c)).normal);
+    SM.h += (norm(b - a) + norm(c - b) + norm(a - c)) /
+            (3 * static_cast<double>(SM.S.triangles.size()));
+  }
+  if (agreement < 0)
+    for (std::array<int, 3>& t : SM.S.triangles) std::swap(t[1], t[2]);
+  std::vector<std::vector<int>> rims = rimLoops(SM.S);
+  if (rims.size() != 1) refuseSM("has " + std::to_string(rims.size()) + " rims instead of one");
+  if (rims[0].size() < 4) refuseSM("has only " + std::to_string(rims[0].size()) + " rim nodes");
+  SM.rim = rims[0];
+  SM.isRim.assign(SM.node.size(), 0);
+  for (int n : SM.rim) SM.isRim[n] = 1;
+  return SM;
+}
+
+/// Turns of S_M's rim at its nodes, > 0 where convex. [rim]
+std::vector<double> approximateTurns(const ApproximatingSurface& SM) {
+  std::vector<Vec3> normal(SM.S.points.size());
+  for (const std::array<int, 3>& t : SM.S.triangles) {
+    Vec3 a = SM.S.points[t[0]], n = cross(SM.S.points[t[1]] - a, SM.S.points[t[2]] - a);
+    for (int i : t) normal[i] += n;
+  }
+  const size_t m = SM.rim.size();
+  std::vector<double> turn(m);
+  for (size_t i = 0; i < m; ++i) {
+    Vec3 p = SM.S.points[SM.rim[i]], in = p - SM.S.points[SM.rim[(i + m - 1) % m]];
+    Vec3 out = SM.S.points[SM.rim[(i + 1) % m]] - p;
+    turn[i] = std::atan2(dot(cross(in, out), unitVector(normal[SM.rim[i]])), dot(in, out));
+  }
+  return turn;
+}
+
+/// [choice] What a convex rim node of S_M (a turn above 45 degrees) is worth as partner of a corner
+/// of S, in squared distances over h².
+constexpr double convexBonus = .5;
+/// [choice] A corner holds no node that is farther away than this, in h: it would only trap
+/// inverted elements.
+constexpr double cornerReach = 2;
+
+double cornerCost(const ApproximatingSurface& SM, const std::vector<double>& turn, int i,
+                  Vec3 corner) {
+  double d2 = norm2(SM.S.points[SM.rim[i]] - corner) / (SM.h * SM.h);
+  return d2 - (turn[i] > sharpTurn ? convexBonus : 0);
+}
+
+/// [§3.6, followRim = false] The rim nodes matched to the four corners in cyclic order, with the
+/// least sum of costs: for each partner of the first corner, dynamic programming over the other
+/// three.
+std::array<int, 4> matchedCorners(const ApproximatingSurface& SM,
+                                  const std::array<Vec3, 4>& corners) {
+  const int m = static_cast<int>(SM.rim.size());
+  std::vector<double> turn = approximateTurns(SM);
+  std::array<RealVector, 4> cost;
+  for (int c = 0; c < 4; ++c)
+    for (int i = 0; i < m; ++i) cost[c].push_back(cornerCost(SM, turn, i, corners[c]));
+  std::array<int, 4> best{0, 1, 2, 3};
+  double least = beyondAll;
+  for (int first = 0; first < m; ++first) {
+    // sum[c] is the least cost of corners 1 .. c placed so far, at[c] are their places
+    std::array<double, 4> sum{cost[0][first], beyondAll, beyondAll, beyondAll};
+    std::array<std::array<int, 4>, 4> at{};
+    at[0][0] = first;
+    for (int step = 1; step < m; ++step)
+      for (int c = 3; c >= 1; --c) {
+        int i = (first + step) % m;
+        if (sum[c - 1] >= beyondAll || sum[c - 1] + cost[c][i] >= sum[c]) continue;
+        sum[c] = sum[c - 1] + cost[c][i];
+        at[c] = at[c - 1];
+        at[c][c] = i;
+      }
+    if (sum[3] < least) {
+      least = sum[3];
+      best = at[3];
+    }
+  }
+  return best;
+}
+
+/// Where the rim nodes of S_M go: arc length on S's rim, and the corner held (-1: none). [rim]
+struct RimTargets {
+  std::vector<double> s;
+  std::vector<int> corner;
+};
+
+std::array<Vec3, 4> cornerPoints(const SurfaceParametrization& Phi) {
+  std::array<Vec3, 4> x;
+  for (int c = 0; c < 4; ++c) x[c] = gamma(Phi.rim, Phi.cornerS[c]);
+  return x;
+}
+
+/// [§3.6, followRim = false] Both rims by arc length between the four corners.
+RimTargets targetsByArcLength(const ApproximatingSurface& SM, const SurfaceParametrization& Phi) {
+  const int m = static_cast<int>(SM.rim.size());
+  const double L = Phi.rim.s.back();
+  std::array<Vec3, 4> corners = cornerPoints(Phi);
+  std::array<int, 4> at = matchedCorners(SM, corners);
+  RimTargets targets{std::vector<double>(m), std::vector<int>(m, -1)};
+  for (int c = 0; c < 4; ++c) {
+    std::vector<double> along{0};
+    int steps = (at[(c + 1) % 4] - at[c] + m) % m;
+    for (int j = 0; j < steps; ++j) {
+      int a = SM.rim[(at[c] + j) % m], b = SM.rim[(at[c] + j + 1) % m];
+      along.push_back(along.back() + norm(SM.S.points[b] - SM.S.points[a]));
+    }
+    double from = Phi.cornerS[c], to = c < 3 ? Phi.cornerS[c + 1] : L;
+    for (int j = 0; j < steps; ++j)
+      targets.s[(at[c] + j) % m] = from + (to - from) * along[j] / along.back();
+    bool near = norm(SM.S.points[SM.rim[at[c]]] - corners[c]) <= cornerReach * SM.h;
+    if (Phi.sharp[c] && near) targets.corner[at[c]] = c;
+  }
+  return targets;
+}
+
+// ---- The rim of S_M follows the nearest rim of S [§3.6 departure] ------------------------------
+
+/// [choice] Weights of the correspondence, against squared distances over h²: 1 − cosine of the two
+/// tangents, and (step on S / step on S_M − 1)². Samples of S's rim per h.
+constexpr double tangentWeight = .5, stepWeight = .25;
+constexpr int samplesPerH = 6, samplesPerNode = 3;
+constexpr double maxTableSize = 4e7;  // entries of the back pointers; fewer samples beyond
+
+/// The rim of S sampled, and the rim of S_M.
+struct RimProblem {
+  double ds;                        // step of the samples
+  std::vector<Vec3> at, direction;  // [samples]
+  std::vector<Vec3> x, tangent;     // [rim nodes]
+  std::vector<double>
+      step;  // [rim nodes], wanted step from node i to the next: its share of S's rim
+  double h;
+  double cost(int i, int k) const {
+    return norm2(x[i] - at[k]) / (h * h) + tangentWeight * (1 - dot(tangent[i], direction[k]));
+  }
+};
+
+RimProblem rimProblem(const ApproximatingSurface& SM, const Curve& rim) {
+  const int m = static_cast<int>(SM.rim.size());
+  const double L = rim.s.back();
+  RimProblem R;
+  R.h = SM.h;
+  int K = std::max(samplesPerNode * m,
+                   static_cast<int>(std::min(std::ceil(samplesPerH * L / SM.h), 1e7)));
+  K = std::max(2 * m, std::min(K, static_cast<int>(maxTableSize / m)));
+  R.ds = L / K;
+  for (int k = 0; k < K; ++k) {
+    R.at.push_back(gamma(rim, k * R.ds));
+    R.direction.push_back(
+        unitVector(gamma(rim, k * R.ds + SM.h / 2) - gamma(rim, k * R.ds - SM.h / 2)));
+  }
+  R.x = pointsOf(SM.S.points, SM.rim);
+  std::vector<double> s = loopArcLength(R.x);
+  for (int i = 0; i < m; ++i) {
+    R.tangent.push_back(unitVector(R.x[(i + 1) % m] - R.x[(i + m - 1) % m]));
+    R.step.push_back((s[i + 1] - s[i]) * L / s.back());
+  }
+  return R;
+}
+
+/// Cost of a step of length g where `wanted` is wanted: quadratic up to three times as long, then
+/// linear.
+constexpr double longStep = 3;
+double stepCost(double g, double wanted) {
+  double r = g / wanted - 1, bend = longStep - 1;
+  return stepWeight * (r <= bend ? r * r : bend * bend + 2 * bend * (r - bend));
+}
+
+/// One layer of the dynamic program: D[k] = cost + min over j < k of D'[j] + stepCost, from[k] the
+/// best j. The linear part of the step cost needs only a running minimum.
+void relaxLayer(const RimProblem& R, int node, double wanted, int origin, int kFirst, int kLast,
+                const RealVector& before, RealVector& D, int* from) {
+  const int K = static_cast<int>(R.at.size());
+  const int window = static_cast<int>(longStep * wanted / R.ds) + 1;
+  const double slope = stepWeight * 2 * (longStep - 1) * R.ds / wanted;
+  RealVector step(window + 1);
+  for (int g = 1; g <= window; ++g) step[g] = stepCost(g * R.ds, wanted);
+  std::fill(D.begin(), D.end(), beyondAll);
+  double farBest = beyondAll;  // least D'[j] − slope j over j < k − window
+  int farFrom = -1, farNext = 0;
+  for (int k = kFirst; k <= kLast; ++k) {
+    for (; farNext < k - window; ++farNext)
+      if (before[farNext] < beyondAll && before[farNext] - slope * farNext < farBest) {
+        farBest = before[farNext] - slope * farNext;
+        farFrom = farNext;
+      }
+    double least = beyondAll;
+    if (farFrom >= 0) {
+      least = farBest + slope * farFrom + stepCost((k - farFrom) * R.ds, wanted);
+      from[k] = farFrom;
+    }
+    for (int g = 1; g <= window && g <= k; ++g)
+      if (before[k - g] + step[g] < least) {
+        least = before[k - g] + step[g];
+        from[k] = k - g;
+      }
+    if (least < beyondAll) D[k] = least + R.cost(node, (origin + k) % K);
+  }
+}
+
+/// The cheapest cyclic assignment of nodes to samples, strictly ascending, with node `pinned` at
+/// sample `origin`: offsets from the origin. [rim nodes], starting with the pinned one
+std::vector<int> assignSamples(const RimProblem& R, int pinned, int origin) {
+  const int m = static_cast<int>(R.x.size()), K = static_cast<int>(R.at.size());
+  std::vector<int> from(static_cast<size_t>(m) * K, -1);
+  RealVector before(K, beyondAll), D(K, beyondAll);
+  before[0] = 0;
+  for (int j = 1; j < m; ++j) {
+    double wanted = R.step[(pinned + j - 1) % m];
+    relaxLayer(R, (pinned + j) % m, wanted, origin, j, K - m + j, before, D,
+               &from[static_cast<size_t>(j) * K]);
+    std::swap(before, D);
+  }
+  int last = m - 1;
+  double least = beyondAll;
+  for (int k = m - 1; k < K; ++k) {
+    double total = before[k] + stepCost((K - k) * R.ds, R.step[(pinned + m - 1) % m]);
+    if (total < least) {
+      least = total;
+      last = k;
+    }
+  }
+  std::vector<int> offset(m);
+  for (int j = m - 1; j >= 0; --j) {
+    offset[j] = last;
+    last = from[static_cast<size_t>(j) * K + last];
+  }
+  return offset;
+}
+
+/// The correspondence of the rims: s of each rim node. Two passes, the second pinned where the
+/// first had the most freedom, opposite to the first pin.
+std::vector<double> followedRim(const RimProblem& R) {
+  const int m = static_cast<int>(R.x.size()), K = static_cast<int>(R.at.size());
+  int pinned = 0, origin = 0;
+  double least = beyondAll;
+  for (int i = 0; i < m; ++i)
+    for (int k = 0; k < K; ++k)
+      if (R.cost(i, k) < least) {
+        least = R.cost(i, k);
+        pinned = i;
+        origin = k;
+      }
+  std::vector<int> offset = assignSamples(R, pinned, origin);
+  origin = (origin + offset[m / 2]) % K;
+  pinned = (pinned + m / 2) % m;
+  offset = assignSamples(R, pinned, origin);
+  std::vector<double> s(m);
+  for (int j = 0; j < m; ++j) s[(pinned + j) % m] = R.ds * ((origin + offset[j]) % K);
+  return s;
+}
+
+/// The ascending sequence nearest to `wanted` (least squares) with steps of at least gap[j] inside
+/// [from, to]: isotonic regression by pooling of adjacent violators. gap has one entry more than
+/// wanted, Σ gap <= to − from.
+std::vector<double> spreadApart(const std::vector<double>& wanted, const std::vector<double>& gap,
+                                double from, double to) {
+  struct Pool {
+    double sum;
+    int count;
+  };
+  std::vector<Pool> pools;
+  double before = 0, all = 0;
+  for (double g : gap) all += g;
+  for (size_t j = 0; j < wanted.size(); ++j) {
+    before += gap[j];
+    pools.push_back({wanted[j] - before, 1});
+    while (pools.size() > 1) {
+      Pool &a = pools[pools.size() - 2], &b = pools.back();
+      if (a.sum / a.count <= b.sum / b.count) break;
+      a = {a.sum + b.sum, a.count + b.count};
+      pools.pop_back();
+    }
+  }
+  std::vector<double> s;
+  before = 0;
+  for (const Pool& p : pools)
+    for (int i = 0; i < p.count; ++i) {
+      before += gap[s.size()];
+      s.push_back(std::min(std::max(p.sum / p.count, from), to - all) + before);
+    }
+  return s;
+}
+
+/// Releases corners, the farthest node first, until those held follow each other as on S's rim.
+void keepCyclicOrder(const ApproximatingSurface& SM, const std::array<Vec3, 4>& corners,
+                     std::vector<int>& corner) {
+  for (int round = 0; round < 4; ++round) {
+    std::vector<int> held;
+    int farthest = -1, descents = 0;
+    double largest = -1;
+    for (int i = 0; i < static_cast<int>(corner.size()); ++i) {
+      if (corner[i] < 0) continue;
+      held.push_back(corner[i]);
+      double d = norm(SM.S.points[SM.rim[i]] - corners[corner[i]]);
+      if (d > largest) {
+        largest = d;
+        farthest = i;
+      }
+    }
+    for (size_t j = 0; j < held.size(); ++j)
+      descents += held[(j + 1) % held.size()] < held[j] ? 1 : 0;
+    if (descents <= 1) return;
+    corner[farthest] = -1;
+  }
+}
+
+/// Holds rim nodes at sharp corners: the cheapest one in reach whose place in the cyclic order is
+/// right.
+std::vector<int> heldCorners(const ApproximatingSurface& SM, const SurfaceParametrization& Phi,
+                             const std::vector<double>& s) {
+  const int m = static_cast<int>(SM.rim.size());
+  const double L = Phi.rim.s.back(), reach = cornerReach * SM.h;
+  std::array<Vec3, 4> corners = cornerPoints(Phi);
+  std::vector<double> turn = approximateTurns(SM);
+  std::vector<int> corner(m, -1);
+  for (int c = 0; c < 4; ++c) {
+    int best = -1;
+    double least = beyondAll;
+    for (int i = 0; i < m && Phi.sharp[c]; ++i) {
+      double arc = arcFrom(Phi.cornerS[c], s[i], L);
+      if (corner[i] >= 0 || norm(SM.S.points[SM.rim[i]] - corners[c]) > reach ||
+          std::fabs(arc) > reach)
+        continue;
+      double cost = cornerCost(SM, turn, i, corners[c]) + arc * arc / (SM.h * SM.h);
+      if (cost < least) {
+        least = cost;
+        best = i;
+      }
+    }
+    if (best >= 0) corner[best] = c;
+  }
+  keepCyclicOrder(SM, corners, corner);
+  return corner;
+}
+
+/// [choice] Least step between rim nodes, of the step their edge on S_M asks for.
+constexpr double leastStep = .25;
+
+/// Moves the nodes between two held ones (positions a < b <= a + m in the loop) apart, from s[a] to
+/// s[a] + arc.
+void spreadArc(const RimProblem& R, int a, int b, double arc, double L, std::vector<double>& s) {
+  const int m = static_cast<int>(s.size());
+  std::vector<double> wanted, gap;
+  double from = s[a % m], sum = 0;
+  for (int i = a; i < b; ++i) {
+    gap.push_back(leastStep * R.step[i % m]);
+    sum += gap.back();
+    if (i > a)
+      wanted.push_back(std::min(
+          std::max(from + arc / 2 + arcFrom(from + arc / 2, s[i % m], L), from), from + arc));
+  }
+  for (double& g : gap) g *= std::min(1.0, .5 * arc / sum);
+  std::vector<double> placed = spreadApart(wanted, gap, from, from + arc);
+  for (int i = a + 1; i < b; ++i) s[i % m] = periodicArc(placed[i - a - 1], L);
+}
+
+/// [§3.6 departure] S_M's rim follows the nearest rim of S.
+RimTargets targetsFollowingRim(const ApproximatingSurface& SM, const SurfaceParametrization& Phi) {
+  const int m = static_cast<int>(SM.rim.size());
+  const double L = Phi.rim.s.back();
+  RimProblem R = rimProblem(SM, Phi.rim);
+  RimTargets targets{followedRim(R), {}};
+  targets.corner = heldCorners(SM, Phi, targets.s);
+  std::vector<int> held;
+  for (int i = 0; i < m; ++i)
+    if (targets.corner[i] >= 0) {
+      held.push_back(i);
+      targets.s[i] = Phi.cornerS[targets.corner[i]];
+    }
+  if (held.empty()) held.push_back(0);
+  for (size_t j = 0; j < held.size(); ++j) {
+    int a = held[j], b = j + 1 < held.size() ? held[j + 1] : held[0] + m;
+    double arc = held.size() == 1 ? L : periodicArc(targets.s[b % m] - targets.s[a], L);
+    spreadArc(R, a, b, arc, L, targets.s);
+  }
+  return targets;
+}
+
+// ---- Anchors and the map -----------------------------------------------------------------------
+
+/// [choice] μ of the anchored equations, and its factor where a triangle folds, before it becomes
+/// 0.
+constexpr double anchorMu = .3, foldedFactor = .2;
+constexpr int maxAnchorRounds = 24;
+
+/// ϕ⁻¹ of the nearest point of S, and its weight. [points of S_M]
+struct Anchors {
+  std::vector<Vec2> u;
+  std::vector<double> mu;
+};
+Anchors anchorsOf(const ApproximatingSurface& SM, const SurfaceDistance& S,
+                  const std::vector<Vec2>& uS) {
+  Anchors A{std::vector<Vec2>(SM.node.size()), std::vector<double>(SM.node.size(), 0.0)};
+  for (size_t i = 0; i < SM.node.size(); ++i) {
+    if (SM.isRim[i]) continue;
+    SurfaceQuery q = S.query(SM.S.points[i]);
+    const std::array<int, 3>& t = S.S.triangles[q.triangle];
+    A.u[i] = q.w[0] * uS[t[0]] + q.w[1] * uS[t[1]] + q.w[2] * uS[t[2]];
+    A.mu[i] = q.onRim ? 0 : anchorMu;
+  }
+  return A;
+}
+
+/// Marks the points of the triangles and `rings` rings of triangles around them.
+std::vector<char> pointsAround(const TriangleSurface& S, const std::vector<int>& triangles,
+                               int rings) {
+  std::vector<char> marked(S.points.size(), 0);
+  for (int t : triangles)
+    for (int n : S.triangles[t]) marked[n] = 1;
+  for (int ring = 0; ring < rings; ++ring) {
+    std::vector<char> next = marked;
+    for (const std::array<int, 3>& t : S.triangles)
+      if (marked[t[0]] || marked[t[1]] || marked[t[2]]) next[t[0]] = next[t[1]] = next[t[2]] = 1;
+    marked = std::move(next);
+  }
+  return marked;
+}
+
+/// [§3.6 departure] ϕ_M⁻¹ with anchors; where triangles fold the anchors go, in growing rings,
+/// until none folds.
+std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, Anchors A, std::vector<Vec2> u,
+                              ProjectionReport& report) {
+  SparseMatrix lambda = meanValueWeights(SM.S.points, SM.S.triangles, SM.isRim);
+  std::vector<char> weakened(SM.node.size(), 0);
+  for (size_t i = 0; i < u.size(); ++i)
+    if (!SM.isRim[i]) u[i] = A.u[i];
+  for (int round = 1; round <= maxAnchorRounds; ++round) {
+    u = anchoredParametrization(lambda, SM.isRim, u, A.mu, A.u);
+    report.rounds = round;
+    std::vector<int> flipped = flippedTriangles(SM.S.triangles, u);
+    if (round == 1) report.flipped = static_cast<int>(flipped.size());
+    if (flipped.empty()) return u;
+    // Rounds 1 and 2 touch the folded triangles only, then one more ring in each.
+    std::vector<char> around = pointsAround(SM.S, flipped, std::max(0, round - 2));
+    for (size_t i = 0; i < around.size(); ++i)
+      if (around[i]) {
+        A.mu[i] = weakened[i] || round > 2 ? 0 : foldedFactor * A.mu[i];
+        weakened[i] = 1;
+      }
+  }
+  return floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
+}
+
+/// [§3.6, eq. (3)] ϕ_M⁻¹ of all points of S_M.
+std::vector<Vec2> approximateParameters(const ApproximatingSurface& SM, const SurfaceDistance& S,
+                                        const SurfaceParametrization& Phi,
+                                        const RimTargets& targets, bool followRim,
+                                        ProjectionReport& report) {
+  std::vector<Vec2> u(SM.node.size());
+  for (size_t i = 0; i < SM.rim.size(); ++i)
+    u[SM.rim[i]] = rimParameter(Phi.cornerS, Phi.rim.s.back(), targets.s[i]);
+  if (followRim) return anchoredMap(SM, anchorsOf(SM, S, Phi.surface.u), u, report);
+  report.rounds = 1;
+  return floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
+}
+
+/// Places one node on the entity of this dimension.
+void placeNode(Mesh& M, int n, int dimension, int entity, Vec2 parameter, Vec3 x) {
+  M.dimension[n] = static_cast<unsigned char>(dimension);
+  M.entity[n] = entity;
+  M.parameter[n] = parameter;
+  M.x[n] = x;
+}
+
+/// [§3.6, eq. (4)] x' = ϕ(ϕ_M⁻¹(x)) inside, γ(s) on the rim, the corner itself where one is held.
+void placeNodes(Mesh& M, int k, int curve, const ApproximatingSurface& SM,
+                const SurfaceParametrization& Phi, const RimTargets& targets,
+                const std::vector<Vec2>& u, ProjectionReport& report) {
+  const Parametrization& surface = M.surfaces[k - 1];
+  for (size_t i = 0; i < SM.node.size(); ++i)
+    if (!SM.isRim[i]) placeNode(M, SM.node[i], 2, k, u[i], varphi(surface, u[i]));
+  for (size_t j = 0; j < SM.rim.size(); ++j) {
+    int n = SM.node[SM.rim[j]], c = targets.corner[j];
+    double s = targets.s[j];
+    if (c < 0) {
+      placeNode(M, n, 1, curve, {s, 0}, gamma(Phi.rim, s));
+      continue;
+    }
+    M.corners.push_back({gamma(Phi.rim, Phi.cornerS[c]), {{curve, Phi.cornerS[c]}}});
+    placeNode(M, n, 0, static_cast<int>(M.corners.size()), {0, 0}, M.corners.back().x);
+    report.cornerNodes.push_back(n);
+  }
+}
+
+}  // namespace
+
+ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool followRim) {
+  const int k = static_cast<int>(M.surfaces.size()) + 1,
+            curve = static_cast<int>(M.curves.size()) + 1;
+  TriangleSurface split = cleaned;
+  splitChords(split);
+  SurfaceDistance S(split);
+  SurfaceParametrization Phi = parametrizeSurface(S);  // ϕ, eq. (3)
+  ApproximatingSurface SM = approximatingSurface(M, k, S);
+  ProjectionReport report;
+  RimTargets targets = followRim ? targetsFollowingRim(SM, Phi) : targetsByArcLength(SM, Phi);
+  std::vector<Vec2> u =
+      approximateParameters(SM, S, Phi, targets, followRim, report);  // ϕ_M⁻¹, eq. (3)
+
+  Phi.surface.rim = curve;
+  Phi.rim.sides[0].surface = k;
+  buildLocator(Phi.surface);
+  M.surfaces.push_back(Phi.surface);
+  M.curves.push_back(Phi.rim);
+  placeNodes(M, k, curve, SM, Phi, targets, u, report);  // x', eq. (4)
+  for (size_t i = 0; i < SM.node.size(); ++i) {
+    double shift = norm(M.x[SM.node[i]] - S.query(SM.S.points[i]).point);
+    if (shift > report.tangentialShift) {
+      report.tangentialShift = shift;
+      report.shiftedNode = SM.node[i];
+    }
+  }
+  return report;
+}
+
+
+// ==== Tools for 3.2: triangle–tetrahedron intersection ===========================================
+
+bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle) {
+  constexpr double tolerance = 1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
+  constexpr int faces[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+  Vec3 polygon[8], clipped[8];  // three corners and at most one more for each plane
+  int corners = 3;
+  for (int i = 0; i < 3; ++i) polygon[i] = triangle[i];
+  for (int i = 0; i < 4; ++i) {
+    const Vec3 a = tet[faces[i][0]], b = tet[faces[i][1]], c = tet[faces[i][2]];
+    Vec3 inward = cross(b - a, c - a);
+    const double height = dot(inward, tet[i] - a);
+    inward = (1 / height) * inward;  // 0 on the face, 1 at the opposite vertex
+    int kept = 0;
+    for (int j = 0; j < corners; ++j) {
+      const Vec3 p = polygon[j], q = polygon[(j + 1) % corners];
+      const double dp = dot(inward, p - a) + tolerance, dq = dot(inward, q - a) + tolerance;
+      if (dp >= 0) clipped[kept++] = p;
+      if ((dp > 0 && dq < 0) || (dp < 0 && dq > 0)) clipped[kept++] = p + dp / (dp - dq) * (q - p);
+    }
+    if (kept == 0) return false;
+    corners = kept;
+    std::copy(clipped, clipped + kept, polygon);
+  }
+  return true;
+}
+
+// ==== 3.2 Volumetric approximation ===============================================================
+
+double longestEdge(const Mesh& M, int E) {
+  double longest = 0;
+  for (int i = 0; i < 4; ++i)
+    for (int j = 0; j < i; ++j) {
+      const Vec3 d = M.xi[M.tets[E][i]] - M.xi[M.tets[E][j]];
+      longest = std::max(longest, norm(Vec3{d.x * M.cube.x, d.y * M.cube.y, d.z * M.cube.z}));
+    }
+  return longest;
+}
+
+bool isTooLarge(const Mesh& M, int E, double lc) { return longestEdge(M, E) >= lc; }
+
+namespace {
+
+/// Whether S meets tetrahedron E: candidates by the tree, then by clipping.
+bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
+  std::array<Vec3, 4> tet;
+  for (int i = 0; i < 4; ++i) tet[i] = M.x[M.tets[E][i]];
+  Vec3 lo = tet[0], hi = tet[0];
+  for (const Vec3& p : tet) {
+    lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
+    hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
+  }
+  const Vec3 margin = 1e-9 * (hi - lo);
+  bool hit = false;
+  S.tree.visit(lo - margin, hi + margin, [&](int t) {
+    const std::array<int, 3>& v = S.S.triangles[t];
+    return hit = intersects(tet, {S.S.points[v[0]], S.S.points[v[1]], S.S.points[v[2]]});
+  });
+  return hit;
+}
+
+enum class Cut : char { unknown, yes, no };
+
+/// Tells of each tetrahedron not yet known whether S cuts it.
+void classify(const Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut) {
+  cut.resize(B.M.tets.size(), Cut::unknown);
+  for (std::size_t E = 0; E < cut.size(); ++E)
+    if (cut[E] == Cut::unknown)
+      cut[E] = meetsSurface(B.M, static_cast<int>(E), S) ? Cut::yes : Cut::no;
+}
+
+/// Refines the tetrahedra cut by S that `wanted` asks for until there is none.
+template <class Wanted>
+void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wanted wanted) {
+  constexpr int maxPasses = 250;  // one level a pass; levels fit in a byte
+  for (int pass = 0; pass < maxPasses; ++pass) {
+    classify(B, S, cut);
+    std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
+    for (std::size_t E = 0; E < cut.size(); ++E)
+      if (cut[E] == Cut::yes && wanted(static_cast<int>(E)))
+        refine.push_back({static_cast<int>(E), B.M.level[E]});
+    if (refine.empty()) return;
+    B.splits.clear();
+    for (const auto& [E, level] : refine)
+      if (B.M.level[E] == level) B.bisect(E);
+    cut.resize(B.M.tets.size(), Cut::unknown);
+    for (const auto& [parent, child] : B.splits) cut[parent] = cut[child] = Cut::unknown;
+  }
+}
+
+}  // namespace
+
+Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc) {
+  std::vector<Cut> cut;
+  refineCut(B, S, cut, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
+  // The level of whole cubes that §3.3 completes T to; T reaches it already here.
+  Approximation A;
+  for (std::size_t E = 0; E < cut.size(); ++E)
+    if (cut[E] == Cut::yes) A.level = std::max(A.level, (B.M.level[E] + 2) / 3 * 3);
+  refineCut(B, S, cut, [&](int E) { return B.M.level[E] < A.level; });
+  A.T.resize(cut.size());
+  for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E] == Cut::yes;
+  return A;
+}
+
+// ==== Tools for 3.3: the lattice of cubes ========================================================
+
+namespace {
+
+/// The cubes of one level in the computational space. Keys are positions in half cubes: odd, odd, odd
+/// is a cube's centre; even, odd, odd a square's; even, even, even a node.
+struct Lattice {
+  double scale;  // cubes per unit of ξ
+  explicit Lattice(int level) : scale(std::ldexp(1., level / 3)) {}
+  static std::uint64_t key(std::array<std::int64_t, 3> half) {
+    return std::uint64_t(half[0]) << 42 | std::uint64_t(half[1]) << 21 | std::uint64_t(half[2]);
+  }
+  static std::array<std::int64_t, 3> position(std::uint64_t key) {
+    constexpr std::uint64_t mask = (1u << 21) - 1;
+    return {std::int64_t(key >> 42), std::int64_t(key >> 21 & mask), std::int64_t(key & mask)};
+  }
+  std::int64_t inside(double c) const { return 2 * std::int64_t(std::floor(c * scale)) + 1; }
+  bool onPlane(double c) const { return c * scale == std::floor(c * scale); }
+  std::uint64_t cubeOf(const Mesh& M, int E) const {
+    const std::array<int, 4>& z = M.tets[E];
+    const Vec3 c = .25 * (M.xi[z[0]] + M.xi[z[1]] + M.xi[z[2]] + M.xi[z[3]]);
+    return key({inside(c.x), inside(c.y), inside(c.z)});
+  }
+  bool isNode(Vec3 xi) const { return onPlane(xi.x) && onPlane(xi.y) && onPlane(xi.z); }
+  std::uint64_t node(Vec3 xi) const {
+    return key({std::int64_t(2 * xi.x * scale), std::int64_t(2 * xi.y * scale),
+                std::int64_t(2 * xi.z * scale)});
+  }
+  /// The square that holds the face; false where the face is inside a cube.
+  bool squareOf(const Mesh& M, std::array<int, 3> face, std::array<std::int64_t, 3>& half) const {
+    const Vec3 a = M.xi[face[0]], b = M.xi[face[1]], c = M.xi[face[2]];
+    const Vec3 middle = (1. / 3) * (a + b + c);
+    half = {inside(middle.x), inside(middle.y), inside(middle.z)};
+    if (a.x == b.x && a.x == c.x && onPlane(a.x)) return half[0] = std::int64_t(2 * a.x * scale), true;
+    if (a.y == b.y && a.y == c.y && onPlane(a.y)) return half[1] = std::int64_t(2 * a.y * scale), true;
+    if (a.z == b.z && a.z == c.z && onPlane(a.z)) return half[2] = std::int64_t(2 * a.z * scale), true;
+    return false;
+  }
+};
+
+std::array<int, 3> faceOpposite(const std::array<int, 4>& z, int i) {
+  return {z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
+}
+
+}  // namespace
+
+// ==== 3.3 Volumetric approximation healing =======================================================
+
+int chi(int nE, int nF, int nC) { return nE - nF + nC; }
+
+int chi(unsigned cubes) {
+  int nE = 0, nF = 0, nC = 0;
+  for (int c = 0; c < 8; ++c) nC += cubes >> c & 1;
+  // edges: the half axes; faces: the quarter planes; each belongs to T with any cube that has it
+  for (int axis = 0; axis < 3; ++axis)
+    for (int side = 0; side < 2; ++side) {
+      bool edge = false;
+      for (int c = 0; c < 8; ++c) edge |= (c >> axis & 1) == side && (cubes >> c & 1);
+      nE += edge;
+      for (int other = 0; other < 2; ++other) {
+        const int axis2 = (axis + 1) % 3;
+        bool face = false;
+        for (int c = 0; c < 8; ++c)
+          face |= (c >> axis & 1) == side && (c >> axis2 & 1) == other && (cubes >> c & 1);
+        nF += face;
+      }
+    }
+  return chi(nE, nF, nC);
+}
+
+bool isFaceConnected(unsigned cubes) {
+  unsigned reached = cubes & -cubes;
+  for (int round = 0; round < 8; ++round)
+    for (int c = 0; c < 8; ++c)
+      for (int axis = 0; axis < 3; ++axis)
+        if ((reached >> c & 1) && (cubes >> (c ^ 1 << axis) & 1)) reached |= 1u << (c ^ 1 << axis);
+  return reached == cubes;
+}
+
+bool isLocalDisk(unsigned cubes) {
+  return cubes == 255 || cubes == 0 ||
+         (chi(cubes) == 1 && isFaceConnected(cubes) && isFaceConnected(255u & ~cubes));
+}
+
+namespace {
+
+/// Adds to T whatever shares a cube with an element of it: a boundary face of T that is not on the
+/// lattice's planes has its neighbour refined to the same level and added.
+void completeCubes(Bisection& B, Approximation& A, std::vector<int> queue) {
+  const Lattice lattice(A.level);
+  std::array<std::int64_t, 3> square;
+  for (std::size_t at = 0; at < queue.size(); ++at)
+    for (int i = 0; i < 4; ++i) {
+      const int E = queue[at];
+      if (lattice.squareOf(B.M, faceOpposite(B.M.tets[E], i), square)) continue;
+      while (B.M.level[B.neighbour[E][i]] < A.level) B.bisect(B.neighbour[E][i]);
+      A.T.resize(B.M.tets.size(), 0);
+      const int next = B.neighbour[E][i];
+      if (A.T[next]) continue;
+      A.T[next] = 1;
+      queue.push_back(next);
+    }
+}
+
+std::vector<int> elementsOf(const std::vector<char>& T) {
+  std::vector<int> elements;
+  for (std::size_t E = 0; E < T.size(); ++E)
+    if (T[E]) elements.push_back(static_cast<int>(E));
+  return elements;
+}
+
+/// For each lattice node of T the cubes of T around it: bit 1 x+, bit 2 y+, bit 4 z+ of the cube's place.
+KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint64_t>& nodes) {
+  const Lattice lattice(A.level);
+  KeyMap cubes, at;
+  for (int E : elementsOf(A.T)) {
+    const std::uint64_t key = lattice.cubeOf(M, E);
+    if (cubes[key]++) continue;
+    const std::array<std::int64_t, 3> p = Lattice::position(key);
+    for (int c = 0; c < 8; ++c) {
+      // seen from its corner at side c the cube lies on the other side
+      const std::uint64_t node = Lattice::key(
+          {p[0] + (c & 1 ? 1 : -1), p[1] + (c & 2 ? 1 : -1), p[2] + (c & 4 ? 1 : -1)});
+      int& mask = at[node];
+      if (mask == 0) nodes.push_back(node);
+      mask |= 1 << (7 - c);
+    }
+  }
+  return at;
+}
+
+/// The elements adjacent to the node, refined to T's level, join T.
+void addElementsAt(Bisection& B, Approximation& A, int node) {
+  std::vector<int> around, added;
+  for (bool coarse = true; coarse;) {
+    coarse = false;
+    B.star(node, around);
+    for (int E : around)
+      if (B.M.level[E] < A.level) {
+        B.bisect(E);
+        coarse = true;
+        break;
+      }
+  }
+  A.T.resize(B.M.tets.size(), 0);
+  for (int E : around)
+    if (!A.T[E]) {
+      A.T[E] = 1;
+      added.push_back(E);
+    }
+  completeCubes(B, A, added);
+}
+
+}  // namespace
+
+void volumetricHealing(Bisection& B, Approximation& A) {
+  constexpr int maxRounds = 200;
+  completeCubes(B, A, elementsOf(A.T));
+  const Lattice lattice(A.level);
+  for (int round = 0; round < maxRounds; ++round) {
+    std::vector<std::uint64_t> keys;
+    const KeyMap cubes = cubesAtNodes(B.M, A, keys);
+    KeyMap meshNode(keys.size());
+    for (int E : elementsOf(A.T))
+      for (int n : B.M.tets[E])
+        if (lattice.isNode(B.M.xi[n])) meshNode[lattice.node(B.M.xi[n])] = n;
+    std::vector<int> bad;
+    for (std::uint64_t key : keys)
+      if (!isLocalDisk(cubes.get(key))) bad.push_back(meshNode.get(key));
+    if (bad.empty()) return;
+    for (int n : bad) {
+      if (B.M.dimension[n] < 3)
+        throw MethodError("insertSurface (§3.3): T reaches the boundary or another surface at node " +
+                          std::to_string(n) + "; lower l_c");
+      addElementsAt(B, A, n);
+    }
+  }
+  throw MethodError("insertSurface (§3.3): T has no boundary that is a surface after " +
+                    std::to_string(maxRounds) + " rounds; lower l_c");
+}
+
+// ==== 3.4 Surface extraction =====================================================================
+
+namespace {
+
+/// The longest edge of a face in the computational space: the one that bisection splits first.
+std::pair<int, int> refinementEdge(const Mesh& M, std::array<int, 3> face) {
+  std::pair<int, int> longest{face[0], face[1]};
+  double length = 0;
+  for (int e = 0; e < 3; ++e) {
+    const double l = norm2(M.xi[face[(e + 1) % 3]] - M.xi[face[e]]);
+    if (l > length) length = l, longest = {face[e], face[(e + 1) % 3]};
+  }
+  return longest;
+}
+
+/// The squares of ∂T: faces of cubes in T whose other cube is not, counter-clockwise from outside.
+void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, SquareSurface& Q) {
+  const Lattice lattice(A.level);
+  KeyMap inside;
+  std::vector<std::uint64_t> cubes;
+  for (int E : elementsOf(A.T)) {
+    const std::uint64_t key = lattice.cubeOf(M, E);
+    if (!inside[key]++) cubes.push_back(key);
+  }
+  for (std::uint64_t key : cubes) {
+    const std::array<std::int64_t, 3> cube = Lattice::position(key);
+    for (int axis = 0; axis < 3; ++axis)
+      for (int side = -1; side <= 1; side += 2) {
+        std::array<std::int64_t, 3> beyond = cube, centre = cube;
+        beyond[axis] += 2 * side;
+        centre[axis] += side;
+        if (inside.get(Lattice::key(beyond))) continue;
+        const int a1 = (axis + (side > 0 ? 1 : 2)) % 3, a2 = (axis + (side > 0 ? 2 : 1)) % 3;
+        constexpr int around[4][2] = {{-1, -1}, {1, -1}, {1, 1}, {-1, 1}};
+        Square s;
+        for (int e = 0; e < 4; ++e) {
+          std::array<std::int64_t, 3> corner = centre;
+          corner[a1] += around[e][0];
+          corner[a2] += around[e][1];
+          s.node[e] = meshNode.get(Lattice::key(corner)) - 1;
+        }
+        s.centre = .25 * (M.x[s.node[0]] + M.x[s.node[1]] + M.x[s.node[2]] + M.x[s.node[3]]);
+        Q.squares.push_back(s);
+        Q.keys.push_back(Lattice::key(centre));
+      }
+  }
+}
+
+/// Joins the squares along their edges; each edge of ∂T has two.
+void joinSquares(SquareSurface& Q) {
+  KeyMap first(2 * Q.squares.size());  // edge → 1 + 4 square + side of the first square that has it
+  for (std::size_t i = 0; i < Q.squares.size(); ++i)
+    for (int e = 0; e < 4; ++e) {
+      Square& s = Q.squares[i];
+      int& other = first[edgeKey(s.node[e], s.node[(e + 1) % 4])];
+      if (other == 0) {
+        other = 1 + 4 * static_cast<int>(i) + e;
+        continue;
+      }
+      const int j = (other - 1) / 4, g = (other - 1) % 4;
+      s.across[e] = j, s.acrossEdge[e] = g;
+      Q.squares[j].across[g] = static_cast<int>(i), Q.squares[j].acrossEdge[g] = e;
+    }
+}
+
+/// Which diagonal of each square is an edge of the mesh: the longest edge of its faces. (Bisection reflects
+/// the cubes: it is not Kuhn's lowest to highest corner.)
+void findDiagonals(const Mesh& M, const Approximation& A, SquareSurface& Q) {
+  const Lattice lattice(A.level);
+  KeyMap squareAt(Q.keys.size());
+  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
+  std::array<std::int64_t, 3> half;
+  for (int E : elementsOf(A.T))
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 3> face = faceOpposite(M.tets[E], i);
+      if (!lattice.squareOf(M, face, half)) continue;
+      const int square = squareAt.get(Lattice::key(half)) - 1;
+      if (square < 0) continue;
+      Square& s = Q.squares[square];
+      const std::pair<int, int> edge = refinementEdge(M, face);
+      for (int d = 0; d < 2; ++d)
+        if (edgeKey(edge.first, edge.second) == edgeKey(s.node[d], s.node[d + 2])) s.diagonal = d;
+    }
+}
+
+/// Squares around each node: (square, corner) in compressed rows over the nodes of ∂T.
+void collectNodes(SquareSurface& Q, int meshNodes) {
+  Q.start.assign(meshNodes + 1, 0);
+  for (const Square& s : Q.squares)
+    for (int n : s.node) ++Q.start[n + 1];
+  for (int n = 0; n < meshNodes; ++n)
+    if (Q.start[n + 1] > 0) Q.nodes.push_back(n);
+  std::partial_sum(Q.start.begin(), Q.start.end(), Q.start.begin());
+  Q.around.resize(Q.start.back());
+  std::vector<int> next(Q.start.begin(), Q.start.end() - 1);
+  for (std::size_t i = 0; i < Q.squares.size(); ++i)
+    for (int e = 0; e < 4; ++e)
+      Q.around[next[Q.squares[i].node[e]]++] = {static_cast<int>(i), e};
+}
+
+}  // namespace
+
+SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
+  const Lattice lattice(A.level);
+  SquareSurface Q;
+  Q.level = A.level;
+  Q.h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) / lattice.scale;
+  KeyMap meshNode;
+  for (int E : elementsOf(A.T))
+    for (int n : M.tets[E])
+      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
+  addSquares(M, A, meshNode, Q);
+  joinSquares(Q);
+  findDiagonals(M, A, Q);
+  collectNodes(Q, static_cast<int>(M.x.size()));
+
+  // ∂T must be one sphere: V − E + F = 2 with E = 2 F, and connected.
+  const int euler = static_cast<int>(Q.nodes.size()) - static_cast<int>(Q.squares.size());
+  std::vector<int> part(1, 0);
+  std::vector<char> seen(Q.squares.size(), 0);
+  if (!seen.empty()) seen[0] = 1;
+  for (std::size_t i = 0; i < part.size() && !seen.empty(); ++i)
+    for (int next : Q.squares[part[i]].across)
+      if (!seen[next]) seen[next] = 1, part.push_back(next);
+  if (euler != 2 || part.size() != Q.squares.size())
+    throw MethodError("insertSurface (§3.3): the boundary of T is no sphere (chi = " +
+                      std::to_string(euler) + ", " + std::to_string(part.size()) + " of " +
+                      std::to_string(Q.squares.size()) +
+                      " squares connected): S comes close to itself within l_c; lower l_c");
+  return Q;
+}
+
+namespace {
+
+/// What the squares of ∂T know of S: sides of their nodes, distances of their quarters.
+/// Quarter e of a square is the triangle of its corners e, e + 1 and its centre.
+struct Survey {
+  std::vector<signed char> side;  // [mesh nodes], +1 or −1, 0 off ∂T
+  std::vector<char> free;         // [squares], 0: touches another surface or the boundary
+  std::vector<double> excess;     // [squares], tangential excess of the centre beyond the rim, in h
+  std::vector<std::array<double, 4>> beyond;  // [squares], the same of the quarters
+  std::vector<std::array<double, 4>> above;   // [squares], distance from the rim of those above S, in h
+  std::vector<char> sharp;        // [mesh nodes], 1: the node nearest to a sharp corner of S
+};
+
+Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
+  Survey survey;
+  survey.side.assign(M.x.size(), 0);
+  survey.sharp.assign(M.x.size(), 0);
+  for (int n : Q.nodes) survey.side[n] = S.query(M.x[n]).side >= 0 ? 1 : -1;
+  const double perH = 1 / Q.h;
+  for (const Square& s : Q.squares) {
+    bool isFree = true;
+    for (int n : s.node) isFree &= M.dimension[n] == 3;
+    survey.free.push_back(isFree);
+    survey.excess.push_back(perH * S.query(s.centre).excess);
+    std::array<double, 4> beyond{}, above{};
+    for (int e = 0; e < 4; ++e) {
+      const Vec3 middle = (1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre);
+      const SurfaceQuery near = S.query(middle);
+      beyond[e] = perH * near.excess;
+      if (!near.onRim) above[e] = perH * S.rimDistance(near.point);
+    }
+    survey.beyond.push_back(beyond);
+    survey.above.push_back(above);
+  }
+  return survey;
+}
+
+constexpr unsigned char emptySquare = 0, fullSquare = 15;
+
+/// The edge-connected parts of the squares for which in(square), numbered from 1; sizes by number.
+template <class In>
+std::vector<int> connectedParts(const SquareSurface& Q, In in, std::vector<int>& sizes) {
+  std::vector<int> part(Q.squares.size(), 0), queue;
+  sizes.assign(1, 0);
+  for (int first = 0; first < static_cast<int>(part.size()); ++first) {
+    if (part[first] || !in(first)) continue;
+    queue.assign(1, first);
+    part[first] = static_cast<int>(sizes.size());
+    for (std::size_t i = 0; i < queue.size(); ++i)
+      for (int next : Q.squares[queue[i]].across)
+        if (!part[next] && in(next)) part[next] = part[first], queue.push_back(next);
+    sizes.push_back(static_cast<int>(queue.size()));
+  }
+  return part;
+}
+
+int largestPart(const std::vector<int>& sizes) {
+  return static_cast<int>(std::max_element(sizes.begin(), sizes.end()) - sizes.begin());
+}
+
+/// Keeps the largest edge-connected part of the selection and fills its holes.
+void keepLargestPart(const SquareSurface& Q, const Survey& survey, Selection& selected) {
+  std::vector<int> sizes;
+  std::vector<int> part = connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
+  const int kept = largestPart(sizes);
+  for (std::size_t i = 0; i < part.size(); ++i)
+    if (part[i] != kept) selected[i] = emptySquare;
+  part = connectedParts(Q, [&](int i) { return selected[i] == 0; }, sizes);
+  const int outside = largestPart(sizes);
+  for (std::size_t i = 0; i < part.size(); ++i)
+    if (part[i] > 0 && part[i] != outside && survey.free[i]) selected[i] = fullSquare;
+}
+
+/// The number of selected quarters at node n, and of rim edges there.
+struct NodeState { int quarters, rimEdges; };
+NodeState nodeState(const SquareSurface& Q, const Selection& selected, int n) {
+  NodeState state{0, 0};
+  for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
+    const auto [square, corner] = Q.around[i];
+    const Square& s = Q.squares[square];
+    const int next = selected[square] >> corner & 1;
+    const int previous = selected[square] >> ((corner + 3) % 4) & 1;
+    const int beyond = selected[s.across[corner]] >> s.acrossEdge[corner] & 1;
+    state.quarters += next + previous;
+    state.rimEdges += (next != previous) + (next != beyond);
+  }
+  return state;
+}
+
+/// A pinch is a node with more than two rim edges: squares at it that are not in its largest fan go.
+bool cutPinches(const SquareSurface& Q, Selection& selected) {
+  bool any = false;
+  for (int n : Q.nodes) {
+    if (nodeState(Q, selected, n).rimEdges <= 2) continue;
+    int least = -1, leastCount = 5;
+    for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
+      const int square = Q.around[i].first;
+      if (!selected[square]) continue;
+      int neighbours = 0;
+      for (int next : Q.squares[square].across) neighbours += selected[next] != 0;
+      if (neighbours < leastCount) leastCount = neighbours, least = square;
+    }
+    selected[least] = emptySquare;
+    any = true;
+  }
+  return any;
+}
+
+}  // namespace
+
+namespace {
+
+/// [§3.4] The squares with all nodes on one side of S; one disk.
+Selection selectSquares(const SquareSurface& Q, const Survey& survey, int side) {
+  constexpr double maxExcess = .75;  // [choice] of h: squares farther beyond the rim are no candidates
+  constexpr int maxRounds = 100;
+  Selection selected(Q.squares.size(), emptySquare);
+  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
+    bool oneSide = survey.free[i] && survey.excess[i] <= maxExcess;
+    for (int n : Q.squares[i].node) oneSide &= survey.side[n] == side;
+    if (oneSide) selected[i] = fullSquare;
+  }
+  for (int round = 0; round < maxRounds; ++round) {
+    keepLargestPart(Q, survey, selected);
+    if (!cutPinches(Q, selected)) break;
+  }
+  return selected;
+}
+
+/// χ of the selection's closure: 1 for a disk (it is connected by construction).
+int chiOf(const SquareSurface& Q, const Selection& selected) {
+  int vertices = 0, edges = 0, faces = 0;
+  for (int n : Q.nodes) vertices += nodeState(Q, selected, n).quarters > 0;
+  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
+    const Square& s = Q.squares[i];
+    vertices += selected[i] != 0;
+    for (int e = 0; e < 4; ++e) {
+      const int here = selected[i] >> e & 1, previous = selected[i] >> ((e + 3) % 4) & 1;
+      const int there = selected[s.across[e]] >> s.acrossEdge[e] & 1;
+      faces += here;
+      edges += here || previous;                                           // the spoke at corner e
+      edges += here && (!there || static_cast<int>(i) < s.across[e]);  // counted once
+    }
+  }
+  return vertices - edges + faces;
+}
+
+/// 0 where S_M is one disk: else what is wrong, for the message.
+std::string diskFault(const SquareSurface& Q, const Selection& selected) {
+  std::vector<int> sizes;
+  connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
+  if (sizes.size() == 1) return "it is empty";
+  if (sizes.size() > 2) return "it has " + std::to_string(sizes.size() - 1) + " parts";
+  for (int n : Q.nodes)
+    if (nodeState(Q, selected, n).rimEdges > 2) return "it is pinched at node " + std::to_string(n);
+  const int euler = chiOf(Q, selected);
+  return euler == 1 ? "" : "chi = " + std::to_string(euler);
+}
+
+}  // namespace
+
+// ==== 3.5 Surface healing ========================================================================
+
+bool removeThinProtrusions(const SquareSurface& Q, Selection& selected) {
+  bool any = false;
+  for (bool again = true; again;) {
+    again = false;
+    for (std::size_t i = 0; i < Q.squares.size(); ++i) {
+      if (selected[i] != fullSquare) continue;
+      int rimEdges = 0;
+      for (int next : Q.squares[i].across) rimEdges += selected[next] == emptySquare;
+      if (rimEdges >= 3) selected[i] = emptySquare, any = again = true;
+    }
+  }
+  return any;
+}
+
+bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected) {
+  bool any = false;
+  for (int n : Q.nodes) {
+    // triangles of S_M at n: two of a square whose diagonal ends at n, else one
+    int triangles = 0, fill = -1;
+    for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
+      const auto [square, corner] = Q.around[i];
+      const Square& s = Q.squares[square];
+      if (selected[square])
+        triangles += corner % 2 == s.diagonal ? 2 : 1;
+      else if (selected[s.across[corner]] && selected[s.across[(corner + 3) % 4]])
+        fill = square;  // both rim edges at n are sides of this square: it is in their plane
+    }
+    if (triangles < 5 || fill < 0 || nodeState(Q, selected, n).rimEdges != 2) continue;
+    bool isFree = true;
+    for (int corner : Q.squares[fill].node) isFree &= M.dimension[corner] == 3;
+    if (isFree) selected[fill] = fullSquare, any = true;
+  }
+  return any;
+}
+
+
+namespace {
+
+/// [§3.5 departure] Rim regularization: squares, whole or halved along a diagonal, are added and removed
+/// one or two at a time while the rim energy falls:
+///   E = Σ over rim nodes (1/16)(k − t)² + Σ over quarters ¼ (distance/h)²
+/// with k selected quarters at the node (of 45° each), t = 4 or at a sharp corner of S 2; the distance is
+/// the tangential excess of a selected quarter beyond the rim of S, or the distance from the rim of an
+/// unselected one above S.
+class RimRegularization {
+ public:
+  RimRegularization(const SquareSurface& Q, const Survey& survey, int side, Selection& selected)
+      : Q_(Q), survey_(survey), side_(side), selected_(selected) {}
+
+  void run(bool halves) {
+    constexpr int maxSweeps = 60;  // E falls in each: only a guard
+    halves_ = halves;
+    for (int sweep = 0; sweep < maxSweeps; ++sweep) {
+      bool improved = false;
+      for (int i = 0; i < static_cast<int>(Q_.squares.size()); ++i)
+        if (isNearRim(i)) improved |= improve(i);
+      if (!improved) return;
+    }
+  }
+
+  /// E over the whole surface.
+  double energy() const {
+    double E = 0;
+    for (int n : Q_.nodes) E += nodeEnergy(n);
+    for (std::size_t i = 0; i < Q_.squares.size(); ++i) E += squareEnergy(static_cast<int>(i));
+    return E;
+  }
+
+ private:
+  static constexpr unsigned char states_[6] = {0, 15, 3, 6, 12, 9};  // empty, full, four halves
+
+  bool isNearRim(int i) const {
+    const bool here = selected_[i] != 0;
+    if (selected_[i] != emptySquare && selected_[i] != fullSquare) return true;
+    for (int n : Q_.squares[i].node)
+      for (int j = Q_.start[n]; j < Q_.start[n + 1]; ++j)
+        if ((selected_[Q_.around[j].first] != 0) != here) return true;
+    return false;
+  }
+
+  /// Full needs all nodes on the side, a half its three corners.
+  bool isAllowed(int i, unsigned char state) const {
+    if (state == emptySquare) return true;
+    if (!survey_.free[i]) return false;
+    for (int e = 0; e < 4; ++e) {
+      const bool used = (state >> e & 1) || (state >> ((e + 3) % 4) & 1);
+      if (used && survey_.side[Q_.squares[i].node[e]] != side_) return false;
+    }
+    return true;
+  }
+
+  double nodeEnergy(int n) const {
+    constexpr double weight = .25 / 4;
+    const NodeState state = nodeState(Q_, selected_, n);
+    if (state.rimEdges == 0) return 0;
+    const double target = survey_.sharp[n] ? 2 : 4;
+    return weight * (state.quarters - target) * (state.quarters - target);
+  }
+  double squareEnergy(int i) const {
+    double E = 0;
+    for (int e = 0; e < 4; ++e) {
+      const auto& n = Q_.squares[i].node;
+      if (survey_.side[n[e]] != side_ || survey_.side[n[(e + 1) % 4]] != side_) continue;
+      const double distance = selected_[i] >> e & 1 ? survey_.beyond[i][e] : survey_.above[i][e];
+      E += .25 * distance * distance;
+    }
+    return E;
+  }
+
+  int quarterAcross(int i, int e) const {
+    const Square& s = Q_.squares[i];
+    return selected_[s.across[e]] >> s.acrossEdge[e] & 1;
+  }
+
+  /// E and χ of what squares i and j (or i alone, j < 0) touch.
+  struct Local { double E; int chi; };
+  Local local(int i, int j) const {
+    Local sum{0, 0};
+    for (int square : {i, j}) {
+      if (square < 0) continue;
+      const Square& s = Q_.squares[square];
+      sum.E += squareEnergy(square);
+      sum.chi += selected_[square] != 0;  // the centre
+      for (int e = 0; e < 4; ++e) {
+        const int here = selected_[square] >> e & 1, previous = selected_[square] >> ((e + 3) % 4) & 1;
+        sum.chi += here - (here || previous);  // quarter and spoke
+        if (square != j || s.across[e] != i) sum.chi -= here || quarterAcross(square, e);
+        if (square == j && isCorner(i, s.node[e])) continue;
+        sum.E += nodeEnergy(s.node[e]);
+        sum.chi += nodeState(Q_, selected_, s.node[e]).quarters > 0;
+      }
+    }
+    return sum;
+  }
+  bool isCorner(int i, int n) const {
+    const auto& nodes = Q_.squares[i].node;
+    return std::find(nodes.begin(), nodes.end(), n) != nodes.end();
+  }
+
+  /// Rules (a), (c), (d) at square i: two rim edges at a node at most, no tip and no notch of 45°.
+  bool isClean(int i) const {
+    const Square& s = Q_.squares[i];
+    for (int n : s.node) {
+      const NodeState state = nodeState(Q_, selected_, n);
+      if (state.rimEdges > 2 || state.quarters == 1) return false;
+    }
+    if (hasNotch(i)) return false;
+    for (int next : s.across)
+      if (hasNotch(next)) return false;
+    return true;
+  }
+  /// A removed quarter of a half square beside a selected quarter.
+  bool hasNotch(int i) const {
+    if (selected_[i] == emptySquare || selected_[i] == fullSquare) return false;
+    for (int e = 0; e < 4; ++e)
+      if (!(selected_[i] >> e & 1) && quarterAcross(i, e)) return true;
+    return false;
+  }
+
+  /// Tries the states of square i alone, then with each of its neighbours; keeps the best that is better.
+  bool improve(int i) {
+    if (tryStates(i, -1)) return true;
+    bool improved = false;
+    for (int j : Q_.squares[i].across)
+      if (survey_.free[j]) improved |= tryStates(i, j);
+    return improved;
+  }
+
+  bool tryStates(int i, int j) {
+    constexpr double least = 1e-9;  // a fall of E below rounding is none
+    const unsigned char oldI = selected_[i], oldJ = j < 0 ? emptySquare : selected_[j];
+    const Local before = local(i, j);
+    double bestE = before.E - least;
+    unsigned char bestI = oldI, bestJ = oldJ;
+    const int count = halves_ ? 6 : 2;
+    for (int a = 0; a < count; ++a) {
+      if (!isAllowed(i, states_[a])) continue;
+      for (int b = 0; b < (j < 0 ? 1 : count); ++b) {
+        if (j >= 0 && !isAllowed(j, states_[b])) continue;
+        selected_[i] = states_[a];
+        if (j >= 0) selected_[j] = states_[b];
+        const Local now = local(i, j);
+        if (now.E < bestE && now.chi == before.chi && isClean(i) && (j < 0 || isClean(j)))
+          bestE = now.E, bestI = states_[a], bestJ = states_[b];
+      }
+    }
+    selected_[i] = bestI;
+    if (j >= 0) selected_[j] = bestJ;
+    return bestI != oldI || (j >= 0 && bestJ != oldJ);
+  }
+
+  const SquareSurface& Q_;
+  const Survey& survey_;
+  int side_;
+  Selection& selected_;
+  bool halves_ = false;
+};
+
+}  // namespace
+
+namespace {
+
+/// 5000 × the area mean over S of max(0, dist(S, S_M)/h − 1.1)²: S must be near its approximation.
+double uncovered(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                 const Selection& selected) {
+  constexpr double weight = 5000, allowed = 1.1;
+  std::vector<std::array<int, 3>> triangles;
+  for (std::size_t i = 0; i < selected.size(); ++i)
+    if (selected[i]) {
+      const auto& n = Q.squares[i].node;
+      triangles.push_back({n[0], n[1], n[2]});
+      triangles.push_back({n[0], n[2], n[3]});
+    }
+  const TriangleTree tree(M.x, triangles);
+  double sum = 0, area = 0;
+  for (const std::array<int, 3>& t : S.S.triangles) {
+    const Vec3 a = S.S.points[t[0]], b = S.S.points[t[1]], c = S.S.points[t[2]];
+    const double part = .5 * norm(cross(b - a, c - a));
+    const double far = tree.closest((1. / 3) * (a + b + c)).distance / Q.h - allowed;
+    area += part;
+    if (far > 0) sum += part * far * far;
+  }
+  return weight * sum / area;
+}
+
+/// Marks for each sharp corner of S the nearest node of this side.
+void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
+                      Survey& survey) {
+  const RimCorners corners = rimCorners(S);
+  for (int c = 0; c < 4; ++c) {
+    if (!corners.sharp[c]) continue;
+    const Vec3 point = S.S.points[S.rim[corners.at[c]]];
+    int nearest = -1;
+    for (int n : Q.nodes)
+      if (survey.side[n] == side &&
+          (nearest < 0 || norm2(M.x[n] - point) < norm2(M.x[nearest] - point)))
+        nearest = n;
+    if (nearest >= 0) survey.sharp[nearest] = 1;
+  }
+}
+
+}  // namespace
+
+Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
+                             Outline outline) {
+  constexpr int maxRounds = 50;
+  Survey survey = surveySquares(M, Q, S);
+  markSharpCorners(M, Q, S, side, survey);
+  Extraction result;
+  result.selected = selectSquares(Q, survey, side);
+  RimRegularization rim(Q, survey, side, result.selected);
+  if (outline == Outline::paper) {
+    for (int round = 0; round < maxRounds; ++round) {
+      bool changed = removeThinProtrusions(Q, result.selected);
+      changed |= fillHighConnectivityNodes(M, Q, result.selected);
+      if (!changed) break;
+    }
+    keepLargestPart(Q, survey, result.selected);
+  } else {
+    rim.run(false);
+    if (outline == Outline::halfSquares) rim.run(true);
+  }
+  result.fault = diskFault(Q, result.selected);
+  if (result.fault.empty()) result.energy = rim.energy() + uncovered(M, Q, S, result.selected);
+  return result;
+}
+
+namespace {
+
+/// The faces labelled k, and the square and quarter of ∂T where each lies.
+int quarterOf(const Mesh& M, const SquareSurface& Q, int square, std::array<int, 3> face) {
+  const Vec3 middle = (1. / 3) * (M.xi[face[0]] + M.xi[face[1]] + M.xi[face[2]]);
+  const std::array<int, 4>& n = Q.squares[square].node;
+  const Vec3 a = M.xi[n[0]], e1 = M.xi[n[1]] - a, e2 = M.xi[n[3]] - a;
+  const double s = dot(middle - a, e1) / norm2(e1), t = dot(middle - a, e2) / norm2(e2);
+  // the diagonals s = t and s + t = 1 part the square
+  return t < s ? (s + t < 1 ? 0 : 1) : (s + t < 1 ? 3 : 2);
+}
+
+}  // namespace
+
+void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A, const Selection& selected,
+                  int k) {
+  Mesh& M = B.M;
+  const Lattice lattice(Q.level);
+  KeyMap squareAt(Q.keys.size());
+  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
+  std::array<std::int64_t, 3> half;
+  for (int E : elementsOf(A.T))
+    for (int i = 0; i < 4; ++i) {
+      const int other = B.neighbour[E][i];
+      if (other < 0 || A.T[other]) continue;
+      if (!lattice.squareOf(M, faceOpposite(M.tets[E], i), half)) continue;
+      const int square = squareAt.get(Lattice::key(half)) - 1;
+      if (square < 0 || !selected[square]) continue;
+      M.faceLabel[E][i] = k;
+      auto& back = B.neighbour[other];
+      M.faceLabel[other][std::find(back.begin(), back.end(), E) - back.begin()] = k;
+    }
+  // A half whose cut is not the mesh's diagonal: bisect that diagonal, the cut appears.
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    if (selected[i] == emptySquare || selected[i] == fullSquare) continue;
+    const Square& s = Q.squares[i];
+    // halves 3 and 12 (corners 0,1,2 / 2,3,0) are cut from corner 0 to 2, 6 and 9 from 1 to 3
+    const int cut = selected[i] == 3 || selected[i] == 12 ? 0 : 1;
+    if (s.diagonal != cut) B.bisectEdge(s.node[1 - cut], s.node[3 - cut]);
+  }
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      if (M.faceLabel[E][i] != k) continue;
+      const std::array<int, 3> face = faceOpposite(M.tets[E], i);
+      lattice.squareOf(M, face, half);
+      const int square = squareAt.get(Lattice::key(half)) - 1;
+      if (!(selected[square] >> quarterOf(M, Q, square, face) & 1)) M.faceLabel[E][i] = 0;
+    }
+}
+
+namespace {
+
+/// S_M as a complex: its nodes, edges and rim, read off the labelled faces.
+struct SurfaceComplex {
+  std::vector<char> node;                          // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
+  KeyMap edges;                                    // edge → times seen (twice a face): 2 rim, 4 inside
+  std::vector<std::pair<int, int>> edgeList;
+  SurfaceComplex(const Mesh& M, int k) : node(M.x.size(), 0) {
+    for (std::size_t E = 0; E < M.tets.size(); ++E)
+      for (int i = 0; i < 4; ++i) {
+        if (M.faceLabel[E][i] != k) continue;
+        const std::array<int, 3> v = faceOpposite(M.tets[E], i);
+        for (int e = 0; e < 3; ++e) {
+          node[v[e]] = 1;
+          if (edges[edgeKey(v[e], v[(e + 1) % 3])]++ == 0) edgeList.push_back({v[e], v[(e + 1) % 3]});
+        }
+      }
+    for (const auto& [a, b] : edgeList)
+      if (isRimEdge(a, b)) node[a] = node[b] = 2;
+  }
+  bool isEdge(int a, int b) const { return edges.get(edgeKey(a, b)) > 0; }
+  bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 2; }
+};
+
+constexpr int tetEdges[6][2] = {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}};
+
+/// Bisects the edges; true where there were any.
+bool bisectEdges(Bisection& B, const std::vector<std::pair<int, int>>& edges) {
+  for (const auto& [a, b] : edges) B.bisectEdge(a, b);
+  return !edges.empty();
+}
+
+}  // namespace
+
+bool refineTetrahedraWithTwoFaces(Bisection& B, int k) {
+  std::vector<std::pair<int, int>> refine;  // tetrahedron, level
+  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
+    const std::array<int, 4>& label = B.M.faceLabel[E];
+    if (std::count(label.begin(), label.end(), k) > 1)
+      refine.push_back({static_cast<int>(E), B.M.level[E]});
+  }
+  for (const auto& [E, level] : refine)
+    if (B.M.level[E] == level) B.bisect(E);
+  return !refine.empty();
+}
+
+bool refineFacesWithTwoRimEdges(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  std::vector<std::pair<int, int>> refine;
+  for (const std::array<int, 4>& z : B.M.tets)
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 3> v = faceOpposite(z, i);
+      if (SM.node[v[0]] != 2 || SM.node[v[1]] != 2 || SM.node[v[2]] != 2) continue;
+      int rimEdges = 0;
+      for (int e = 0; e < 3; ++e) rimEdges += SM.isRimEdge(v[e], v[(e + 1) % 3]);
+      if (rimEdges > 1) refine.push_back(refinementEdge(B.M, v));
+    }
+  return bisectEdges(B, refine);
+}
+
+bool refineEdgesAcrossTheRim(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  std::vector<std::pair<int, int>> refine;
+  for (const auto& [a, b] : SM.edgeList)
+    if (SM.node[a] == 2 && SM.node[b] == 2 && !SM.isRimEdge(a, b)) refine.push_back({a, b});
+  return bisectEdges(B, refine);
+}
+
+bool refineEdgesBetweenSurfaces(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  const std::size_t before = B.M.tets.size();
+  std::vector<std::pair<int, int>> refine;
+  for (const std::array<int, 4>& z : B.M.tets)
+    for (const auto& e : tetEdges) {
+      const int a = z[e[0]], b = z[e[1]];
+      if ((SM.node[a] && B.M.dimension[b] < 3 && !SM.node[b]) ||
+          (SM.node[b] && B.M.dimension[a] < 3 && !SM.node[a]))
+        refine.push_back({a, b});
+    }
+  bisectEdges(B, refine);
+  return B.M.tets.size() > before;
+}
+
+bool refineToFullSubcomplex(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  std::vector<std::pair<int, int>> refine;
+  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
+    const std::array<int, 4>& z = B.M.tets[E];
+    for (const auto& e : tetEdges)
+      if (SM.node[z[e[0]]] && SM.node[z[e[1]]] && !SM.isEdge(z[e[0]], z[e[1]]))
+        refine.push_back({z[e[0]], z[e[1]]});
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 3> v = faceOpposite(z, i);
+      if (B.M.faceLabel[E][i] != k && SM.isEdge(v[0], v[1]) && SM.isEdge(v[1], v[2]) &&
+          SM.isEdge(v[2], v[0]))
+        refine.push_back(refinementEdge(B.M, v));
+    }
+  }
+  return bisectEdges(B, refine);
+}
+
+int surfaceHealing(Bisection& B, int k) {
+  constexpr int maxRounds = 30;  // [choice] rounds end after 2 to 5 where they end
+  for (int round = 1; round <= maxRounds; ++round) {
+    bool changed = refineTetrahedraWithTwoFaces(B, k);
+    changed |= refineFacesWithTwoRimEdges(B, k);
+    changed |= refineEdgesAcrossTheRim(B, k);
+    changed |= refineEdgesBetweenSurfaces(B, k);
+    changed |= refineToFullSubcomplex(B, k);
+    if (!changed) return round;
+  }
+  throw MethodError("insertSurface (§3.5): the rules of surface healing do not settle after " +
+                    std::to_string(maxRounds) + " rounds; lower l_c");
+}
+
+// ==== 3. Surface insertion =======================================================================
+
+InsertOptions InsertOptions::paper() {
+  InsertOptions options;
+  options.outline = Outline::paper;
+  options.followRim = false;
+  options.optimize = OptimizeOptions::paper();
+  return options;
+}
+
+namespace {
+
+/// What §3.1 asks of M: a valid meccano mesh.
+void checkMesh(const Mesh& M) {
+  const std::size_t nodes = M.x.size(), tets = M.tets.size();
+  if (tets == 0) throw InputError("insertSurface (§3.1): the mesh has no tetrahedra");
+  if (M.xi.size() != nodes)
+    throw InputError(
+        "insertSurface (§3.1): the mesh has no computational coordinates, which bisection and "
+        "projection need; make it by boxMesh or `meccano box`, or read a meccano .vtk");
+  if (M.type.size() != tets || M.level.size() != tets || M.faceLabel.size() != tets ||
+      M.dimension.size() != nodes || M.entity.size() != nodes || M.parameter.size() != nodes)
+    throw InputError(
+        "insertSurface (§3.1): the mesh lacks types, levels, labels or entities of some elements; "
+        "make it by boxMesh, or read a meccano .vtk");
+  const QualityStatistics q = qualityStatistics(M);
+  if (q.inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(q.inverted) +
+                     " inverted elements; untangle it first (optimizeMesh)");
+}
+
+/// Whether p lies in one of the tetrahedra.
+bool contains(const Mesh& M, Vec3 p) {
+  for (const std::array<int, 4>& z : M.tets) {
+    bool in = true;
+    for (int i = 0; i < 4 && in; ++i) {
+      const std::array<int, 3> v = faceOpposite(z, i);
+      const Vec3 normal = cross(M.x[v[1]] - M.x[v[0]], M.x[v[2]] - M.x[v[0]]);
+      in = dot(normal, p - M.x[v[0]]) * dot(normal, M.x[z[i]] - M.x[v[0]]) >= 0;
+    }
+    if (in) return true;
+  }
+  return false;
+}
+
+/// The limits of l_c, before any work: dist(∂M, S), and the size of what comes.
+void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) {
+  std::vector<std::array<int, 3>> boundary;
+  for (std::size_t p = 1; p <= M.patches.size(); ++p)
+    for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) boundary.push_back(face);
+  const Gap gap = smallestGap(S.tree, M.x, boundary);
+  const std::string where = " at triangle " + std::to_string(gap.triangle) + " near (" +
+                            number(gap.point.x) + ", " + number(gap.point.y) + ", " +
+                            number(gap.point.z) + ")";
+  if (gap.distance <= 0 || !contains(M, S.S.points[0]))
+    throw InputError("insertSurface (§3.1): S touches or leaves the domain" +
+                     (gap.distance <= 0 ? where : std::string()) + "; it must lie inside");
+  if (!(lc < gap.distance))
+    throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below dist(∂M, S) = " +
+                     number(gap.distance) + where + "; lower l_c");
+  constexpr double tetsPerSquare = 45;  // [choice] measured 36 to 55 per cube face of area of S
+  const double edge = std::max({M.cube.x, M.cube.y, M.cube.z});
+  const double halvings = std::max(0., std::ceil(std::log2(std::sqrt(3.) * edge / lc)));
+  const double h = edge / std::exp2(halvings);
+  double area = 0;
+  for (const auto& t : S.S.triangles)
+    area += .5 * norm(cross(S.S.points[t[1]] - S.S.points[t[0]], S.S.points[t[2]] - S.S.points[t[0]]));
+  const double predicted = static_cast<double>(M.tets.size()) + tetsPerSquare * area / (h * h);
+  if (predicted > maxTets)
+    throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " asks for about " +
+                     number(predicted) + " tetrahedra, above the limit of " +
+                     std::to_string(maxTets) + "; raise l_c or the limit");
+  constexpr double latticeSize = 1 << 19;  // cubes along an axis that a lattice key holds
+  for (const Vec3& xi : M.xi)
+    if (std::max({xi.x, xi.y, xi.z}) * std::exp2(halvings) > latticeSize)
+      throw InputError("insertSurface (§3.2): l_c = " + number(lc) +
+                       " is below 1/500000 of the domain; raise l_c");
+}
+
+/// One way to insert S: a side, and how the outline of S_M is made.
+struct Way { int side; Outline outline; Extraction extraction; };
+
+/// The state of an insertion, from the copy of the caller's mesh on.
+struct Insertion {
+  const SurfaceDistance& S;
+  const InsertOptions& options;
+  Mesh M;              // refined by §3.2 and §3.3
+  Approximation A;
+  SquareSurface Q;
+  int k;               // number of the new surface
+  std::vector<std::string> faults;  // why ways were left
+
+  void stage(const char* name, const Mesh& mesh) const {
+    if (options.onStage) options.onStage(name, mesh);
+  }
+  void progress(const std::string& line) const {
+    if (options.onProgress) options.onProgress(line);
+  }
+};
+
+std::string describe(const Way& way) {
+  return std::string(way.side > 0 ? "positive" : "negative") + " side, " +
+         (way.outline == Outline::halfSquares ? "half squares" : "whole squares");
+}
+
+/// §3.4 on both sides: the ways to go on, best first.
+std::vector<Way> extractWays(Insertion& I) {
+  std::vector<Outline> outlines{I.options.outline};
+  if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
+  std::vector<Way> ways;
+  for (int side : {1, -1})
+    for (Outline outline : outlines) {
+      Way way{side, outline, surfaceExtraction(I.M, I.Q, I.S, side, outline)};
+      if (way.extraction.fault.empty())
+        ways.push_back(std::move(way));
+      else
+        I.faults.push_back(describe(way) + ": S_M is no disk (" + way.extraction.fault + ")");
+    }
+  std::stable_sort(ways.begin(), ways.end(), [](const Way& a, const Way& b) {
+    if (a.outline != b.outline) return a.outline == Outline::halfSquares;
+    return a.extraction.energy < b.extraction.energy;
+  });
+  return ways;
+}
+
+/// Nodes of S_M and their neighbours: where the optimization starts.
+std::vector<int> nodesNear(const Mesh& M, int k) {
+  std::vector<char> near(M.x.size(), 0), on(M.x.size(), 0);
+  for (const auto& face : surfaceFaces(M, k))
+    for (int n : face) on[n] = 1;
+  for (const std::array<int, 4>& z : M.tets)
+    if (on[z[0]] || on[z[1]] || on[z[2]] || on[z[3]])
+      for (int n : z) near[n] = 1;
+  std::vector<int> nodes;
+  for (std::size_t n = 0; n < near.size(); ++n)
+    if (near[n]) nodes.push_back(static_cast<int>(n));
+  return nodes;
+}
+
+/// §3.4's labels, 3.5, 3.6 and 3.7 on a copy of the refined mesh.
+void follow(const Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
+  Bisection B(M);
+  labelSurface(B, I.Q, I.A, way.extraction.selected, I.k);
+  I.stage("extracted", M);
+  const int rounds = surfaceHealing(B, I.k);
+  if (surfaceFaces(M, I.k).empty())
+    throw MethodError("insertSurface (§3.5): S_M vanished in healing; lower l_c");
+  report.refined = qualityStatistics(M);
+  I.stage("surfaceHealed", M);
+  I.progress("3.5 surface healing: " + std::to_string(rounds) + " rounds, " +
+             std::to_string(M.tets.size()) + " tetrahedra (" + describe(way) + ")");
+  const ProjectionReport projection = surfaceProjection(M, I.S.S, I.options.followRim);
+  report.tangentialShift = projection.tangentialShift;
+  report.projected = qualityStatistics(M);
+  I.stage("projected", M);
+  I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
+  OptimizeOptions optimize = I.options.optimize;
+  optimize.active = nodesNear(M, I.k);
+  report.optimization = optimizeMesh(M, optimize);
+  report.smoothed = qualityStatistics(M);
+  I.progress("3.7 optimization: " + std::to_string(report.optimization.sweeps) + " sweeps, " +
+             std::to_string(report.smoothed.inverted) + " inverted, min " +
+             number(report.smoothed.min) + ", mean " + number(report.smoothed.mean));
+  if (report.smoothed.inverted > 0)
+    throw MethodError("insertSurface (§3.7): " + std::to_string(report.smoothed.inverted) +
+                      " elements stay inverted");
+}
+
+/// The measures of S_M that the report promises, and the warnings.
+void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertReport& report) {
+  constexpr int samples = 4;
+  constexpr double poorHausdorff = .3, poorShift = 2;
+  const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
+  std::vector<char> on(M.x.size(), 0);
+  for (const auto& face : faces)
+    for (int n : face) {
+      if (on[n]++) continue;
+      ++report.nodes;
+      report.maxNodeDistance = std::max(report.maxNodeDistance, S.query(M.x[n]).distance);
+      on[n] = 1;
+    }
+  report.triangles = static_cast<int>(faces.size());
+  report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
+  if (report.hausdorff > poorHausdorff * report.lc)
+    report.warnings.push_back("the Hausdorff distance S_M - S, " + number(report.hausdorff) +
+                              ", is above .3 l_c; lower l_c");
+  if (report.tangentialShift > poorShift * h)
+    report.warnings.push_back("the projection moved a node " + number(report.tangentialShift) +
+                              " along S, more than 2 cube edges; lower l_c");
+}
+
+/// One l_c: 3.2 to 3.7, all ways until one is good; the best valid one. False where none is valid.
+bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions& options, double lc,
+                    Mesh& result, InsertReport& report, std::vector<std::string>& faults) {
+  constexpr double goodQuality = .45;  // [choice] below it the other ways are tried too
+  Insertion I{S, options, M, {}, {}, static_cast<int>(M.surfaces.size()) + 1, {}};
+  Bisection B(I.M);
+  I.A = volumetricApproximation(B, S, lc);
+  I.stage("refined", I.M);
+  volumetricHealing(B, I.A);
+  I.Q = boundarySquares(I.M, I.A);
+  I.stage("healed", I.M);
+  I.progress("3.2-3.3 approximation: " + std::to_string(I.M.tets.size()) + " tetrahedra, " +
+             std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
+  const bool first = options.outline == Outline::paper;
+  bool valid = false;
+  for (const Way& way : extractWays(I)) {
+    Mesh trial = I.M;
+    InsertReport now = report;
+    now.surface = I.k, now.lc = lc;
+    try {
+      follow(I, way, trial, now);
+      measureSurface(trial, S, I.Q.h, now);
+    } catch (const Error& error) {
+      faults.push_back(describe(way) + ": " + error.what());
+      continue;
+    }
+    if (!valid || now.smoothed.min > report.smoothed.min) report = now, result = std::move(trial);
+    valid = true;
+    if (first || report.smoothed.min >= goodQuality) break;
+  }
+  faults.insert(faults.begin(), I.faults.begin(), I.faults.end());
+  return valid;
+}
+
+}  // namespace
+
+InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
+  constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
+  checkMesh(M);
+  if (!(options.lc > 0) || !std::isfinite(options.lc))
+    throw InputError("insertSurface (§3.2): l_c = " + number(options.lc) + " must be above 0");
+  InsertReport report;
+  report.original = qualityStatistics(M);
+  const SurfaceDistance cleaned(checkSurface(S, report.warnings));
+  checkSize(M, cleaned, options.lc, options.maxTets);
+
+  Mesh result;
+  std::vector<std::string> faults;
+  double lc = options.lc;
+  for (int halving = 0; halving <= maxHalvings; ++halving, lc /= 2) {
+    if (halving > 0) checkSize(M, cleaned, lc, options.maxTets);
+    bool valid = false;
+    try {
+      valid = insertWithSize(M, cleaned, options, lc, result, report, faults);
+    } catch (const MethodError& error) {
+      faults.push_back(error.what());
+    }
+    if (!valid) continue;
+    if (halving > 0)
+      report.warnings.push_back("l_c was halved to " + number(lc) + ": " + faults.front());
+    report.regular = qualityStatistics(result, Ideal::regular);
+    if (options.onStage) options.onStage("smoothed", result);
+    M = std::move(result);
+    return report;
+  }
+  std::string why;
+  for (const std::string& fault : faults) why += "\n  " + fault;
+  throw MethodError("insertSurface (§3): l_c = " + number(options.lc) +
+                    " does not resolve S, nor does half of it; lower l_c:" + why);
+}
+
+}  // namespace meccano

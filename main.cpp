@@ -1,0 +1,1511 @@
+// SPDX-License-Identifier: MIT
+//
+// The command line over the library: everything that touches a file, the terminal or argv.
+//   Files            reading whole files, writing beside the target and renaming
+//   Wavefront OBJ    surfaces in
+//   VTK legacy       meshes out and in, with all that a later insertion needs
+//   Commands         box, insert, optimize, stats
+//   Arguments        options, help, exit status: 0 done and valid, 1 an error, 2 wrong usage
+#include "meccano.hpp"
+
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <charconv>
+#include <climits>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <filesystem>
+#include <iostream>
+#include <map>
+#include <memory>
+#include <new>
+#include <numeric>
+#include <string_view>
+
+namespace meccano::app {
+
+namespace fs = std::filesystem;
+
+// ==== Files =====================================================================================
+
+using File = std::unique_ptr<std::FILE, int (*)(std::FILE*)>;
+
+[[noreturn]] void fail(const std::string& sentence) { throw InputError(sentence); }
+
+std::string systemError() { return std::strerror(errno); }
+
+/// The bytes of a file. Errors: InputError where there is no such file, or it cannot be read.
+std::string readFile(const std::string& path) {
+  std::error_code none;
+  if (fs::is_directory(path, none)) fail(path + ": this is a folder; name a file in it");
+  File file(std::fopen(path.c_str(), "rb"), std::fclose);
+  if (!file) fail(path + ": cannot be read (" + systemError() + "); check its name and its rights");
+  std::string text;
+  std::vector<char> block(1 << 20);
+  while (const std::size_t n = std::fread(block.data(), 1, block.size(), file.get()))
+    text.append(block.data(), n);
+  if (std::ferror(file.get())) fail(path + ": reading broke off (" + systemError() + ")");
+  return text;
+}
+
+/// Devices and pipes (/dev/full, /dev/stdout) are written to as they are, never replaced.
+bool isDevice(const fs::path& path) {
+  std::error_code none;
+  const fs::file_status s = fs::status(path, none);
+  return fs::exists(s) && !fs::is_regular_file(s) && !fs::is_directory(s);
+}
+
+[[noreturn]] void failWriting(const std::string& path, const std::string& why) {
+  fail(path + ": cannot be written (" + why + "); nothing was written, choose another output");
+}
+
+/// A file beside its target with a name of its own. It disappears again unless it is put in place.
+class Temporary {
+ public:
+  explicit Temporary(const std::string& target) : asked_(target), target_(target) {
+    std::error_code none;
+    if (fs::is_directory(target_, none)) failWriting(asked_, "it is a folder");
+    if (fs::is_symlink(target_, none)) target_ = fs::weakly_canonical(target_, none);
+    if (fs::exists(target_, none) && ::access(target_.c_str(), W_OK) != 0)
+      failWriting(asked_, systemError());
+    for (int i = 0; !file_ && i < 1000; ++i) {
+      const std::string own = std::to_string(::getpid()) + "-" + std::to_string(i);
+      name_ = target_.string() + "." + own + ".tmp";
+      file_.reset(std::fopen(name_.c_str(), "wbx"));
+      if (!file_ && errno != EEXIST) break;
+    }
+    if (!file_) {
+      name_.clear();
+      failWriting(asked_, errno == ENOENT ? "its folder does not exist" : systemError());
+    }
+  }
+  Temporary(const Temporary&) = delete;
+  Temporary& operator=(const Temporary&) = delete;
+  ~Temporary() {
+    file_.reset();
+    if (!name_.empty()) std::remove(name_.c_str());
+  }
+  void write(const std::string& text) {
+    const bool whole = std::fwrite(text.data(), 1, text.size(), file_.get()) == text.size() &&
+                       std::fflush(file_.get()) == 0;
+    if (!whole) failWriting(asked_, systemError());
+    if (std::fclose(file_.release()) != 0) failWriting(asked_, systemError());
+  }
+  /// Renames it to the target, which keeps its rights if it was there.
+  void putInPlace() {
+    std::error_code error;
+    const fs::file_status old = fs::status(target_, error);
+    if (fs::exists(old)) fs::permissions(name_, old.permissions(), error);
+    fs::rename(name_, target_, error);
+    if (error) failWriting(asked_, error.message());
+    name_.clear();
+  }
+
+ private:
+  std::string asked_;
+  fs::path target_;
+  std::string name_;
+  File file_{nullptr, std::fclose};
+};
+
+void writeDevice(const std::string& path, const std::string& text) {
+  File file(std::fopen(path.c_str(), "wb"), std::fclose);
+  if (!file) failWriting(path, systemError());
+  const bool whole = std::fwrite(text.data(), 1, text.size(), file.get()) == text.size() &&
+                     std::fflush(file.get()) == 0;
+  if (!whole || std::fclose(file.release()) != 0) failWriting(path, systemError());
+}
+
+/// Tells before a long computation whether its result can be written; leaves nothing behind.
+void checkWritable(const std::string& path) {
+  if (!isDevice(path)) Temporary probe(path);
+}
+
+struct Output { std::string path, text; };
+
+/// Writes all or none: each file beside its target first, renamed when every one is complete.
+void writeFiles(const std::vector<Output>& outputs) {
+  std::vector<std::unique_ptr<Temporary>> files;
+  for (const Output& o : outputs) {
+    if (isDevice(o.path)) continue;
+    files.push_back(std::make_unique<Temporary>(o.path));
+    files.back()->write(o.text);
+  }
+  for (const Output& o : outputs)
+    if (isDevice(o.path)) writeDevice(o.path, o.text);
+  for (const auto& file : files) file->putInPlace();
+}
+
+// ==== Text ======================================================================================
+
+/// A growing text; doubles in the shortest form that reads back as the same double.
+class Text {
+ public:
+  Text& operator<<(std::string_view s) { return text_.append(s), *this; }
+  Text& operator<<(int value) { return put(value); }
+  Text& operator<<(double value) { return put(value); }
+  std::string take() { return std::move(text_); }
+
+ private:
+  template <class Number>
+  Text& put(Number value) {
+    char digits[32];
+    text_.append(digits, std::to_chars(digits, digits + sizeof digits, value).ptr);
+    return *this;
+  }
+  std::string text_;
+};
+
+/// printf into a string, for tables and messages.
+template <class... Values>
+std::string format(const char* pattern, Values... values) {
+  char text[512];
+  const int n = std::snprintf(text, sizeof text, pattern, values...);
+  return std::string(text, std::clamp(n, 0, static_cast<int>(sizeof text) - 1));
+}
+
+bool isSpace(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; }
+
+/// The whole word as a number; false where it is none. A leading + is allowed, as in printf's %+g.
+bool parse(std::string_view word, double& value) {
+  if (!word.empty() && word[0] == '+') word.remove_prefix(1);
+  const auto [end, error] = std::from_chars(word.data(), word.data() + word.size(), value);
+  if (end != word.data() + word.size() || word.empty()) return false;
+  if (error == std::errc()) return true;
+  if (error != std::errc::result_out_of_range) return false;
+  value = std::strtod(std::string(word).c_str(), nullptr);  // 0 or ∞: beyond the range of double
+  return true;
+}
+
+bool parse(std::string_view word, int& value) {
+  const auto [end, error] = std::from_chars(word.data(), word.data() + word.size(), value);
+  return error == std::errc() && end == word.data() + word.size();
+}
+
+/// Walks over a text word by word, and knows the line for messages.
+class Scanner {
+ public:
+  Scanner(const std::string& name, const std::string& text) : name_(name), text_(text) {}
+
+  bool atEnd() {
+    while (at_ < text_.size() && isSpace(text_[at_])) ++at_;
+    return at_ == text_.size();
+  }
+  std::string_view word(const char* what) {
+    const bool end = atEnd();
+    start_ = at_;
+    if (end) failHere(std::string("the file ends where ") + what + " should be; it is truncated");
+    while (at_ < text_.size() && !isSpace(text_[at_])) ++at_;
+    return std::string_view(text_).substr(start_, at_ - start_);
+  }
+  bool consumed() const { return at_ == text_.size(); }
+  void skip(std::size_t bytes) { at_ += bytes; }
+  /// The rest of the line, without its end.
+  std::string_view line() {
+    start_ = at_;
+    at_ = std::min(text_.find('\n', at_), text_.size());
+    std::string_view rest = std::string_view(text_).substr(start_, at_ - start_);
+    if (at_ < text_.size()) ++at_;
+    if (!rest.empty() && rest.back() == '\r') rest.remove_suffix(1);
+    return rest;
+  }
+  template <class Number>
+  Number number(const char* what) {
+    const std::string_view w = word(what);
+    Number value{};
+    if (!parse(w, value))
+      failHere("'" + std::string(w.substr(0, 40)) + "' is no number where " + what + " should be");
+    return value;
+  }
+  /// A number of things of which each takes a byte or more: nothing is reserved for a lie.
+  int count(const char* what) {
+    const int n = number<int>(what);
+    if (n < 0) failHere(std::string("the number of ") + what + " is negative");
+    checkRest(n, what);
+    return n;
+  }
+  void checkRest(std::size_t n, const std::string& what) const {
+    if (n > text_.size() - at_)
+      failHere("the " + what + " (" + std::to_string(n) +
+               ") are more than the rest of the file holds; it is truncated");
+  }
+  [[noreturn]] void failHere(const std::string& what) const {
+    const auto lines = std::count(text_.begin(), text_.begin() + start_, '\n');
+    fail(name_ + ":" + std::to_string(lines + 1) + ": " + what);
+  }
+  [[noreturn]] void failAsWhole(const std::string& what) const { fail(name_ + ": " + what); }
+
+ private:
+  const std::string& name_;
+  const std::string& text_;
+  std::size_t at_ = 0, start_ = 0;
+};
+
+// ==== Wavefront OBJ =============================================================================
+
+/// The words of a line, up to a comment.
+void splitWords(std::string_view line, std::vector<std::string_view>& words) {
+  words.clear();
+  for (std::size_t i = 0; i < line.size();) {
+    if (isSpace(line[i])) {
+      ++i;
+      continue;
+    }
+    const std::size_t start = i;
+    while (i < line.size() && !isSpace(line[i])) ++i;
+    if (line[start] == '#') return;
+    words.push_back(line.substr(start, i - start));
+  }
+}
+
+Vec3 objVertex(const std::vector<std::string_view>& words, const Scanner& at) {
+  Vec3 x;
+  if (words.size() < 4)
+    at.failHere("a vertex needs three coordinates, here are " + std::to_string(words.size() - 1) +
+                "; complete the line or remove it with its faces");
+  double* const to[3] = {&x.x, &x.y, &x.z};
+  for (int i = 0; i < 3; ++i)
+    if (!parse(words[i + 1], *to[i]))
+      at.failHere("'" + std::string(words[i + 1]) + "' is no number; correct the coordinate");
+  if (!isFinite(x)) at.failHere("a coordinate is not finite; correct it");
+  return x;
+}
+
+/// The vertex of a face corner a, a/b, a//c or a/b/c; negative numbers count from the last vertex.
+int objIndex(std::string_view corner, int vertices, const Scanner& at) {
+  int number = 0;
+  bool good = parse(corner.substr(0, corner.find('/')), number);
+  for (char c : corner.substr(std::min(corner.find('/'), corner.size())))
+    good &= c == '/' || c == '-' || (c >= '0' && c <= '9');
+  if (!good)
+    at.failHere("'" + std::string(corner) +
+                "' is no face corner; it is written 7, 7/1, 7//1 or 7/1/1");
+  const int index = number > 0 ? number - 1 : vertices + number;
+  if (number == 0 || index < 0 || index >= vertices)
+    at.failHere("the face names vertex " + std::to_string(number) + ", above are " +
+                std::to_string(vertices) + "; correct the index (they start at 1)");
+  return index;
+}
+
+/// The `v` and `f` lines of an OBJ file; polygons become fans, everything else is ignored.
+TriangleSurface parseObj(const std::string& name, const std::string& text) {
+  TriangleSurface S;
+  S.name = fs::path(name).stem().string();
+  Scanner in(name, text);
+  if (in.atEnd()) in.failAsWhole("the file is empty; an OBJ file with v and f lines is needed");
+  Scanner lines(name, text);
+  if (text.compare(0, 3, "\xEF\xBB\xBF") == 0) lines.skip(3);  // a byte order mark
+  std::vector<std::string_view> words;
+  while (!lines.consumed()) {
+    splitWords(lines.line(), words);
+    if (words.empty()) continue;
+    if (words[0] == "v") S.points.push_back(objVertex(words, lines));
+    if (words[0] != "f") continue;
+    if (words.size() < 4)
+      lines.failHere("a face needs three corners, here are " + std::to_string(words.size() - 1) +
+                     "; complete the line or remove it");
+    const int n = static_cast<int>(S.points.size());
+    const int first = objIndex(words[1], n, lines);
+    for (int last = objIndex(words[2], n, lines), i = 3; i < static_cast<int>(words.size()); ++i) {
+      const int next = objIndex(words[i], n, lines);
+      S.triangles.push_back({first, last, next});
+      last = next;
+    }
+  }
+  if (S.triangles.empty())
+    lines.failAsWhole("no triangle in it (" + std::to_string(S.points.size()) +
+                      " vertices, no f line); is it a Wavefront OBJ file?");
+  return S;
+}
+
+/// Gives points that coincide exactly one number; returns how many went.
+int weld(TriangleSurface& S) {
+  std::vector<int> order(S.points.size()), number(S.points.size());
+  std::iota(order.begin(), order.end(), 0);
+  auto key = [&](int i) {
+    return std::array<double, 3>{S.points[i].x, S.points[i].y, S.points[i].z};
+  };
+  std::sort(order.begin(), order.end(), [&](int a, int b) {
+    return key(a) != key(b) ? key(a) < key(b) : a < b;
+  });
+  int gone = 0;
+  for (std::size_t i = 0; i < order.size(); ++i) {
+    const bool again = i > 0 && S.points[order[i]] == S.points[order[i - 1]];
+    number[order[i]] = again ? number[order[i - 1]] : order[i];
+    gone += again;
+  }
+  for (std::array<int, 3>& t : S.triangles)
+    for (int& n : t) n = number[n];
+  return gone;
+}
+
+/// Drops triangles of no area and those that are there twice; returns how many went.
+int dropTriangles(TriangleSurface& S) {
+  std::map<std::array<int, 3>, int> seen;
+  std::vector<std::array<int, 3>> kept;
+  for (const std::array<int, 3>& t : S.triangles) {
+    std::array<int, 3> key = t;
+    std::sort(key.begin(), key.end());
+    const Vec3 a = S.points[t[0]], b = S.points[t[1]], c = S.points[t[2]];
+    const bool flat = key[0] == key[1] || key[1] == key[2] || norm2(cross(b - a, c - a)) == 0;
+    if (!flat && seen[key]++ == 0) kept.push_back(t);
+  }
+  const int gone = static_cast<int>(S.triangles.size() - kept.size());
+  S.triangles = kept;
+  return gone;
+}
+
+/// Removes the points no triangle uses.
+void dropPoints(TriangleSurface& S) {
+  std::vector<int> number(S.points.size(), -1);
+  for (const std::array<int, 3>& t : S.triangles)
+    for (int n : t) number[n] = 0;
+  std::vector<Vec3> kept;
+  for (std::size_t i = 0; i < number.size(); ++i)
+    if (number[i] == 0) {
+      number[i] = static_cast<int>(kept.size());
+      kept.push_back(S.points[i]);
+    }
+  for (std::array<int, 3>& t : S.triangles)
+    for (int& n : t) n = number[n];
+  S.points = kept;
+}
+
+/// Reads and cleans a surface; what was cleaned away is added to the warnings.
+TriangleSurface readSurface(const std::string& path, std::vector<std::string>& warnings) {
+  TriangleSurface S = parseObj(path, readFile(path));
+  const int welded = weld(S), dropped = dropTriangles(S);
+  dropPoints(S);
+  if (welded)
+    warnings.push_back(path + ": " + std::to_string(welded) + " coinciding points welded");
+  if (dropped)
+    warnings.push_back(path + ": " + std::to_string(dropped) +
+                       " duplicate or flat triangles dropped");
+  if (S.triangles.empty()) fail(path + ": no triangle is left without the duplicate and flat ones");
+  return S;
+}
+
+// ==== VTK legacy: the arrays ====================================================================
+
+/// A named array of numbers: field, point or cell data.
+struct Array {
+  std::string name;
+  int components = 1;
+  bool integer = false;
+  std::vector<double> values;  // [tuples * components]; integers below 2^53 are exact
+
+  int tuples() const { return static_cast<int>(values.size()) / components; }
+  void add(double value) { values.push_back(value); }
+  void add(Vec2 u) { values.insert(values.end(), {u.x, u.y}); }
+  void add(Vec3 x) { values.insert(values.end(), {x.x, x.y, x.z}); }
+};
+
+using Arrays = std::map<std::string, Array>;
+
+/// Takes an array apart from front to back; what is short, long or no integer is refused.
+class Unpacking {
+ public:
+  Unpacking(const Arrays& arrays, const char* name, int components, const Scanner& in)
+      : name_(name), in_(in) {
+    const auto found = arrays.find(name);
+    if (found == arrays.end()) return;
+    array_ = &found->second;
+    if (array_->components != components)
+      refuse("has " + std::to_string(array_->components) + " components, not " +
+             std::to_string(components));
+  }
+  bool atEnd() const { return !array_ || at_ == array_->values.size(); }
+  double real() {
+    if (atEnd()) refuse("is too short");
+    const double value = array_->values[at_++];
+    if (!std::isfinite(value)) refuse("holds a number that is not finite");
+    return value;
+  }
+  int integer(int low, int high) {
+    const double value = real();
+    if (!(value >= low && value <= high && value == std::floor(value)))
+      refuse("holds " + format("%.9g", value) + " where an integer from " + std::to_string(low) +
+             " to " + std::to_string(high) + " is due");
+    return static_cast<int>(value);
+  }
+  Vec2 vec2() {
+    const double x = real();
+    return {x, real()};
+  }
+  Vec3 vec3() {
+    const double x = real(), y = real();
+    return {x, y, real()};
+  }
+  void finish() const {
+    if (!atEnd()) refuse("is too long");
+  }
+
+ private:
+  [[noreturn]] void refuse(const std::string& what) const {
+    in_.failAsWhole("array '" + name_ + "' " + what + "; the file is damaged, write it anew");
+  }
+  std::string name_;
+  const Scanner& in_;
+  const Array* array_ = nullptr;
+  std::size_t at_ = 0;
+};
+
+// Geometry in the FIELD block. Lists of different lengths are packed one behind the other:
+//   cube             3  edge lengths of an undeformed cube
+//   surface_size     5  label (k or -p), points, triangles, rim, bytes of the name
+//   surface_points   3, surface_u 2, surface_triangles 3, surface_name 1 (bytes)
+//   curve_size       3  points, closed, sides
+//   curve_points     3, curve_s 1 (one more where closed), curve_side 1 (label), curve_u 2
+//   corner_point     3, corner_places 1 (number), corner_curve 1, corner_s 1
+
+void packSurface(const Parametrization& P, int label, std::array<Array, 5>& a) {
+  for (int n : {label, static_cast<int>(P.points.size()), static_cast<int>(P.triangles.size()),
+                P.rim, static_cast<int>(P.name.size())})
+    a[0].add(n);
+  for (Vec3 x : P.points) a[1].add(x);
+  for (Vec2 u : P.u) a[2].add(u);
+  for (const std::array<int, 3>& t : P.triangles)
+    for (int n : t) a[3].add(n);
+  for (char c : P.name) a[4].add(static_cast<unsigned char>(c));
+}
+
+void packCurve(const Curve& C, std::array<Array, 5>& a) {
+  for (int n : {static_cast<int>(C.points.size()), static_cast<int>(C.closed),
+                static_cast<int>(C.sides.size())})
+    a[0].add(n);
+  for (Vec3 x : C.points) a[1].add(x);
+  for (double s : C.s) a[2].add(s);
+  for (const Curve::Side& side : C.sides) {
+    a[3].add(side.surface);
+    for (Vec2 u : side.u) a[4].add(u);
+  }
+}
+
+void packCorner(const Corner& corner, std::array<Array, 4>& a) {
+  a[0].add(corner.x);
+  a[1].add(static_cast<int>(corner.on.size()));
+  for (const Corner::Place& place : corner.on) {
+    a[2].add(place.curve);
+    a[3].add(place.s);
+  }
+}
+
+std::vector<Array> packGeometry(const Mesh& M) {
+  Array cube{"cube", 3, false, {M.cube.x, M.cube.y, M.cube.z}};
+  std::array<Array, 5> surfaces{{{"surface_size", 5, true, {}},
+                                 {"surface_points", 3, false, {}},
+                                 {"surface_u", 2, false, {}},
+                                 {"surface_triangles", 3, true, {}},
+                                 {"surface_name", 1, true, {}}}};
+  for (std::size_t k = 0; k < M.surfaces.size(); ++k)
+    packSurface(M.surfaces[k], static_cast<int>(k) + 1, surfaces);
+  for (std::size_t p = 0; p < M.patches.size(); ++p)
+    packSurface(M.patches[p], -static_cast<int>(p) - 1, surfaces);
+  std::array<Array, 5> curves{{{"curve_size", 3, true, {}},
+                               {"curve_points", 3, false, {}},
+                               {"curve_s", 1, false, {}},
+                               {"curve_side", 1, true, {}},
+                               {"curve_u", 2, false, {}}}};
+  for (const Curve& C : M.curves) packCurve(C, curves);
+  std::array<Array, 4> corners{{{"corner_point", 3, false, {}},
+                                {"corner_places", 1, true, {}},
+                                {"corner_curve", 1, true, {}},
+                                {"corner_s", 1, false, {}}}};
+  for (const Corner& c : M.corners) packCorner(c, corners);
+  std::vector<Array> all{cube};
+  for (const auto* group : {&surfaces, &curves})
+    for (const Array& a : *group)
+      if (!a.values.empty()) all.push_back(a);
+  for (const Array& a : corners)
+    if (!a.values.empty()) all.push_back(a);
+  return all;
+}
+
+bool inUnitSquare(Vec2 u) {
+  constexpr double rounding = 1e-6;  // of the solve for u
+  return std::abs(u.x - .5) <= .5 + rounding && std::abs(u.y - .5) <= .5 + rounding;
+}
+
+void unpackSurfaces(const Arrays& field, Mesh& M, const Scanner& in) {
+  Unpacking size(field, "surface_size", 5, in), points(field, "surface_points", 3, in),
+      u(field, "surface_u", 2, in), triangles(field, "surface_triangles", 3, in),
+      name(field, "surface_name", 1, in);
+  while (!size.atEnd()) {
+    const int label = size.integer(-INT_MAX, INT_MAX);
+    std::vector<Parametrization>& list = label > 0 ? M.surfaces : M.patches;
+    if (std::abs(label) != static_cast<int>(list.size()) + 1)
+      in.failAsWhole("surface labels in 'surface_size' are not 1, 2, ..., -1, -2, ...");
+    list.emplace_back();
+    Parametrization& P = list.back();
+    const int nodes = size.integer(3, INT_MAX), count = size.integer(1, INT_MAX);
+    P.rim = size.integer(0, INT_MAX);
+    const int bytes = size.integer(0, INT_MAX);
+    for (int i = 0; i < nodes; ++i) {
+      P.points.push_back(points.vec3());
+      P.u.push_back(u.vec2());
+      if (!inUnitSquare(P.u.back())) in.failAsWhole("a point of 'surface_u' is not in [0,1]^2");
+    }
+    for (int i = 0; i < count; ++i) {
+      const int a = triangles.integer(0, nodes - 1), b = triangles.integer(0, nodes - 1);
+      P.triangles.push_back({a, b, triangles.integer(0, nodes - 1)});
+    }
+    for (int i = 0; i < bytes; ++i) P.name += static_cast<char>(name.integer(0, 255));
+    buildLocator(P);
+  }
+  for (const Unpacking* a : {&points, &u, &triangles, &name}) a->finish();
+}
+
+void unpackCurves(const Arrays& field, Mesh& M, const Scanner& in) {
+  Unpacking size(field, "curve_size", 3, in), points(field, "curve_points", 3, in),
+      s(field, "curve_s", 1, in), side(field, "curve_side", 1, in), u(field, "curve_u", 2, in);
+  const int surfaces = static_cast<int>(M.surfaces.size());
+  const int patches = static_cast<int>(M.patches.size());
+  while (!size.atEnd()) {
+    Curve C;
+    const int nodes = size.integer(2, INT_MAX);
+    C.closed = size.integer(0, 1) == 1;
+    const int sides = size.integer(0, INT_MAX);
+    for (int i = 0; i < nodes; ++i) C.points.push_back(points.vec3());
+    for (int i = 0; i < nodes + C.closed; ++i) C.s.push_back(s.real());
+    if (C.s[0] != 0 || !std::is_sorted(C.s.begin(), C.s.end()) || !(C.s.back() > 0))
+      in.failAsWhole("arc lengths in 'curve_s' do not grow from 0; the file is damaged");
+    for (int i = 0; i < sides; ++i) {
+      C.sides.push_back({side.integer(-patches, surfaces), {}});
+      if (C.sides.back().surface == 0) in.failAsWhole("a side in 'curve_side' is 0, no surface");
+      for (int j = 0; j < nodes; ++j) C.sides.back().u.push_back(u.vec2());
+    }
+    M.curves.push_back(C);
+  }
+  for (const Unpacking* a : {&points, &s, &side, &u}) a->finish();
+  for (const auto* list : {&M.surfaces, &M.patches})
+    for (const Parametrization& P : *list)
+      if (P.rim > static_cast<int>(M.curves.size()))
+        in.failAsWhole("surface '" + P.name + "' has rim " + std::to_string(P.rim) + ", the file " +
+                       std::to_string(M.curves.size()) + " curves; it is damaged");
+}
+
+void unpackCorners(const Arrays& field, Mesh& M, const Scanner& in) {
+  Unpacking point(field, "corner_point", 3, in), places(field, "corner_places", 1, in),
+      curve(field, "corner_curve", 1, in), s(field, "corner_s", 1, in);
+  while (!point.atEnd()) {
+    Corner corner{point.vec3(), {}};
+    for (int i = places.integer(0, INT_MAX); i > 0; --i) {
+      const int c = curve.integer(1, static_cast<int>(M.curves.size()));
+      corner.on.push_back({c, s.real()});
+    }
+    M.corners.push_back(corner);
+  }
+  for (const Unpacking* a : {&places, &curve, &s}) a->finish();
+}
+
+// ==== VTK legacy: writing =======================================================================
+
+/// A labelled face as the file has it, with the worst q of the tetrahedra beside it.
+struct Face {
+  std::array<int, 3> nodes;
+  int label;
+  double q;
+};
+
+struct Cells {
+  std::vector<std::array<int, 4>> tets;  // [tets], positively oriented
+  std::vector<double> q;                 // [tets], eq. (7)
+  std::vector<Face> faces;               // inserted surfaces 1, 2, ..., then patches 1, 2, ...
+};
+
+double sixVolumes(const std::vector<Vec3>& x, const std::array<int, 4>& z) {
+  return det({x[z[1]] - x[z[0]], x[z[2]] - x[z[0]], x[z[3]] - x[z[0]]});
+}
+
+bool hasDirectedEdge(const std::array<int, 3>& t, int a, int b) {
+  return (t[0] == a && t[1] == b) || (t[1] == a && t[2] == b) || (t[2] == a && t[0] == b);
+}
+
+/// Turns the triangles of S_M all one way: that of 𝓢, where their nodes know their u.
+void orientSheet(const Mesh& M, std::vector<Face>& faces) {
+  std::multimap<std::pair<int, int>, int> atEdge;
+  for (std::size_t f = 0; f < faces.size(); ++f)
+    for (int i = 0; i < 3; ++i)
+      atEdge.insert({std::minmax(faces[f].nodes[i], faces[f].nodes[(i + 1) % 3]), f});
+  std::vector<char> seen(faces.size(), 0);
+  std::vector<int> stack;
+  for (std::size_t seed = 0; seed < faces.size(); ++seed) {
+    if (!seen[seed]) stack.push_back(static_cast<int>(seed)), seen[seed] = 1;
+    while (!stack.empty()) {
+      const std::array<int, 3> t = faces[stack.back()].nodes;
+      stack.pop_back();
+      for (int i = 0; i < 3; ++i) {
+        const int a = t[i], b = t[(i + 1) % 3];
+        const auto range = atEdge.equal_range(std::minmax(a, b));
+        for (auto it = range.first; it != range.second; ++it) {
+          if (seen[it->second]++) continue;
+          std::array<int, 3>& other = faces[it->second].nodes;
+          if (hasDirectedEdge(other, a, b)) std::swap(other[1], other[2]);
+          stack.push_back(it->second);
+        }
+      }
+    }
+  }
+  double area = 0;  // in 𝓤, where 𝓢 turns counter-clockwise
+  for (const Face& f : faces) {
+    bool known = true;
+    for (int n : f.nodes) known &= M.dimension[n] == 2 && M.entity[n] == f.label;
+    const Vec2 u = M.parameter[f.nodes[0]];
+    if (known) area += cross(M.parameter[f.nodes[1]] - u, M.parameter[f.nodes[2]] - u);
+  }
+  if (area < 0)
+    for (Face& f : faces) std::swap(f.nodes[1], f.nodes[2]);
+}
+
+/// A face of an inserted surface is seen from both of its tetrahedra: keeps the first of each two.
+void joinFaces(std::vector<Face>& faces) {
+  std::map<std::array<int, 3>, int> number;
+  std::vector<Face> once;
+  for (const Face& f : faces) {
+    std::array<int, 3> key = f.nodes;
+    std::sort(key.begin(), key.end());
+    const auto [at, isNew] = number.insert({key, static_cast<int>(once.size())});
+    if (isNew)
+      once.push_back(f);
+    else
+      once[at->second].q = std::min(once[at->second].q, f.q);
+  }
+  faces = once;
+}
+
+/// The bisection order, the last two vertices swapped where the tetrahedron would be negative in
+/// the computational space. A mesh without that space keeps its order, inverted elements and all.
+Cells cellsOf(const Mesh& M) {
+  constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+  Cells C;
+  C.tets = M.tets;
+  C.q = qualities(M);
+  if (M.xi.empty()) return C;
+  std::map<int, std::vector<Face>> inserted, boundary;
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    std::array<int, 4>& z = C.tets[E];
+    std::array<int, 4> label = M.faceLabel[E];
+    if (sixVolumes(M.xi, z) < 0) {
+      std::swap(z[2], z[3]);
+      std::swap(label[2], label[3]);
+    }
+    for (int i = 0; i < 4; ++i) {
+      if (label[i] == 0) continue;
+      const int* o = outward[i];
+      auto& list = label[i] > 0 ? inserted[label[i]] : boundary[-label[i]];
+      list.push_back({{z[o[0]], z[o[1]], z[o[2]]}, label[i], C.q[E]});
+    }
+  }
+  for (auto& [k, faces] : inserted) {
+    joinFaces(faces);
+    orientSheet(M, faces);
+    C.faces.insert(C.faces.end(), faces.begin(), faces.end());
+  }
+  for (auto& [p, faces] : boundary) C.faces.insert(C.faces.end(), faces.begin(), faces.end());
+  return C;
+}
+
+void putField(Text& out, const std::vector<Array>& arrays) {
+  out << "FIELD meccano " << static_cast<int>(arrays.size()) << "\n";
+  for (const Array& a : arrays) {
+    out << a.name << " " << a.components << " " << a.tuples() << (a.integer ? " int" : " double");
+    for (std::size_t i = 0; i < a.values.size(); ++i) {
+      out << (i % a.components == 0 ? "\n" : " ");
+      if (a.integer)
+        out << static_cast<int>(a.values[i]);
+      else
+        out << a.values[i];
+    }
+    out << "\n";
+  }
+}
+
+void putCells(Text& out, const Cells& C) {
+  const int tets = static_cast<int>(C.tets.size()), faces = static_cast<int>(C.faces.size());
+  out << "CELLS " << tets + faces << " " << 5 * tets + 4 * faces << "\n";
+  for (const std::array<int, 4>& z : C.tets)
+    out << "4 " << z[0] << " " << z[1] << " " << z[2] << " " << z[3] << "\n";
+  for (const Face& f : C.faces)
+    out << "3 " << f.nodes[0] << " " << f.nodes[1] << " " << f.nodes[2] << "\n";
+  out << "CELL_TYPES " << tets + faces << "\n";
+  for (int i = 0; i < tets; ++i) out << "10\n";
+  for (int i = 0; i < faces; ++i) out << "5\n";
+}
+
+/// One column of data with its head; `value` gives the number of each entry.
+template <class Value>
+void putScalars(Text& out, const char* head, std::size_t count, Value value) {
+  out << "SCALARS " << head << "\nLOOKUP_TABLE default\n";
+  for (std::size_t i = 0; i < count; ++i) out << value(i) << "\n";
+}
+
+void putCellData(Text& out, const Mesh& M, const Cells& C) {
+  const std::size_t tets = C.tets.size(), all = tets + C.faces.size();
+  out << "CELL_DATA " << static_cast<int>(all) << "\n";
+  if (!M.xi.empty()) {
+    putScalars(out, "surface int", all,
+               [&](std::size_t i) { return i < tets ? 0 : C.faces[i - tets].label; });
+    putScalars(out, "level int", all,
+               [&](std::size_t i) { return i < tets ? int(M.level[i]) : -1; });
+  }
+  putScalars(out, "quality double", all,
+             [&](std::size_t i) { return i < tets ? C.q[i] : C.faces[i - tets].q; });
+}
+
+void putPointData(Text& out, const Mesh& M) {
+  const std::size_t nodes = M.x.size();
+  out << "POINT_DATA " << static_cast<int>(nodes) << "\nVECTORS computational double\n";
+  for (Vec3 x : M.xi) out << x.x << " " << x.y << " " << x.z << "\n";
+  putScalars(out, "dimension int", nodes, [&](std::size_t n) { return int(M.dimension[n]); });
+  putScalars(out, "entity int", nodes, [&](std::size_t n) { return M.entity[n]; });
+  out << "SCALARS parameter double 2\nLOOKUP_TABLE default\n";
+  for (Vec2 u : M.parameter) out << u.x << " " << u.y << "\n";
+}
+
+/// The mesh as a VTK legacy file: a function of the mesh alone, and parseVtk() gives the mesh back.
+std::string vtkText(const Mesh& M) {
+  const Cells C = cellsOf(M);
+  Text out;
+  out << "# vtk DataFile Version 3.0\nmeccano mesh\nASCII\nDATASET UNSTRUCTURED_GRID\n";
+  if (!M.xi.empty()) putField(out, packGeometry(M));
+  out << "POINTS " << static_cast<int>(M.x.size()) << " double\n";
+  for (Vec3 x : M.x) out << x.x << " " << x.y << " " << x.z << "\n";
+  putCells(out, C);
+  putCellData(out, M, C);
+  if (!M.xi.empty()) putPointData(out, M);
+  return out.take();
+}
+
+// ==== VTK legacy: reading =======================================================================
+
+/// What a VTK legacy file says, before it is a mesh.
+struct VtkFile {
+  std::vector<Vec3> points;
+  std::vector<int> start, nodes, types;  // nodes of cell c: nodes[start[c] .. start[c+1])
+  Arrays field, pointData, cellData;
+};
+
+std::string upper(std::string_view word) {
+  std::string s(word);
+  for (char& c : s)
+    if (c >= 'a' && c <= 'z') c = static_cast<char>(c - 'a' + 'A');
+  return s;
+}
+
+Array readArray(Scanner& in, const std::string& name, int components, int tuples) {
+  Array a;
+  a.name = name;
+  a.components = components;
+  const std::size_t count = std::size_t(components) * tuples;
+  in.checkRest(count, "numbers of array '" + name + "'");
+  a.values.reserve(count);
+  for (std::size_t i = 0; i < count; ++i) a.values.push_back(in.number<double>("a value"));
+  return a;
+}
+
+void readField(Scanner& in, Arrays& to) {
+  in.word("the name of the field");
+  for (int arrays = in.count("arrays"); arrays > 0; --arrays) {
+    const std::string name(in.word("the name of an array"));
+    const int components = in.count("components"), tuples = in.count("tuples");
+    if (components == 0) in.failHere("array '" + name + "' has no components; write the file anew");
+    if (upper(in.word("the type of an array")) != "STRING") {
+      to[name] = readArray(in, name, components, tuples);
+      continue;
+    }
+    in.line();
+    for (long long i = 0; i < 1LL * components * tuples && !in.consumed(); ++i) in.line();
+  }
+}
+
+void readPoints(Scanner& in, VtkFile& file) {
+  const int count = in.count("points");
+  in.word("the type of the points");
+  file.points.resize(count);
+  for (Vec3& x : file.points) {
+    x.x = in.number<double>("a coordinate");
+    x.y = in.number<double>("a coordinate");
+    x.z = in.number<double>("a coordinate");
+    if (!isFinite(x)) in.failHere("a coordinate is not finite; correct it");
+  }
+}
+
+int readNode(Scanner& in, const VtkFile& file) {
+  const int n = in.number<int>("a node"), count = static_cast<int>(file.points.size());
+  if (n < 0 || n >= count)
+    in.failHere("node " + std::to_string(n) + " does not exist, there are " +
+                std::to_string(count) + " points; correct the index (they start at 0)");
+  return n;
+}
+
+/// Cells as versions up to 4 write them: for each its number of nodes, and these.
+void readCells(Scanner& in, VtkFile& file, int cells, int size) {
+  file.start.assign(1, 0);
+  for (int c = 0; c < cells; ++c) {
+    for (int n = in.count("nodes of a cell"); n > 0; --n) file.nodes.push_back(readNode(in, file));
+    file.start.push_back(static_cast<int>(file.nodes.size()));
+  }
+  if (static_cast<int>(file.nodes.size()) + cells != size)
+    in.failHere("the cells take " + std::to_string(file.nodes.size() + cells) +
+                " numbers, CELLS promises " + std::to_string(size) + "; write the file anew");
+}
+
+/// Cells as version 5 writes them: OFFSETS and CONNECTIVITY.
+void readCells5(Scanner& in, VtkFile& file, int offsets, int size) {
+  in.word("OFFSETS");
+  in.word("the type of the offsets");
+  for (int i = 0; i < offsets; ++i) file.start.push_back(in.number<int>("an offset"));
+  if (offsets < 1 || file.start[0] != 0 || file.start.back() != size ||
+      !std::is_sorted(file.start.begin(), file.start.end()))
+    in.failHere("the offsets do not grow from 0 to " + std::to_string(size) +
+                "; write the file anew");
+  in.word("CONNECTIVITY");
+  in.word("the type of the connectivity");
+  for (int i = 0; i < size; ++i) file.nodes.push_back(readNode(in, file));
+}
+
+/// One attribute of the points or cells; false where the keyword is none.
+bool readAttribute(Scanner& in, const std::string& key, Arrays& to, int count) {
+  static const std::map<std::string, int> fixedSize{{"VECTORS", 3},    {"NORMALS", 3},
+                                                    {"TENSORS", 9},    {"TENSORS6", 6},
+                                                    {"GLOBAL_IDS", 1}, {"PEDIGREE_IDS", 1}};
+  const auto fixed = fixedSize.find(key);
+  if (fixed == fixedSize.end() && key != "SCALARS" && key != "LOOKUP_TABLE" &&
+      key != "COLOR_SCALARS" && key != "TEXTURE_COORDINATES")
+    return false;
+  const std::string name(in.word("the name of an attribute"));
+  int components = fixed == fixedSize.end() ? 1 : fixed->second;
+  if (key == "LOOKUP_TABLE") {
+    readArray(in, name, 4, in.count("colours of a table"));
+    return true;
+  }
+  if (key == "COLOR_SCALARS" || key == "TEXTURE_COORDINATES")
+    components = in.count("components");
+  if (key != "COLOR_SCALARS") in.word("the type of an attribute");
+  if (key == "SCALARS") {
+    std::string next = upper(in.word("LOOKUP_TABLE"));
+    if (parse(next, components)) next = upper(in.word("LOOKUP_TABLE"));
+    if (next != "LOOKUP_TABLE") in.failHere("'" + next + "' is where LOOKUP_TABLE should be");
+    in.word("the name of the table");
+  }
+  if (components < 1 || components > 9) in.failHere("an attribute has 1 to 9 components");
+  to[name] = readArray(in, name, components, count);
+  return true;
+}
+
+/// The two lines before the sections.
+void readHead(Scanner& in) {
+  if (in.atEnd()) in.failAsWhole("the file is empty; a VTK legacy mesh is needed");
+  if (in.line().substr(0, 14) != "# vtk DataFile")
+    in.failAsWhole("this is no VTK legacy file (no '# vtk DataFile' in the first line); meshes are "
+                   "read from .vtk files");
+  in.line();
+  const std::string coding = upper(in.word("ASCII"));
+  if (coding == "BINARY")
+    in.failHere("this VTK file is binary; save it as ASCII (ParaView: Save Data, File Type Ascii)");
+  if (coding != "ASCII") in.failHere("'" + coding.substr(0, 40) + "' is where ASCII should be");
+}
+
+void readCellSection(Scanner& in, VtkFile& file, bool version5) {
+  const int cells = in.count("cells"), size = in.count("numbers of the cells");
+  if (version5)
+    readCells5(in, file, cells, size);
+  else
+    readCells(in, file, cells, size);
+}
+
+void readTypes(Scanner& in, VtkFile& file) {
+  const int count = in.count("cell types");
+  for (int i = 0; i < count; ++i) file.types.push_back(in.number<int>("a cell type"));
+}
+
+VtkFile readSections(Scanner& in, bool version5) {
+  VtkFile file;
+  Arrays* data = &file.field;
+  int count = 0;
+  while (!in.atEnd()) {
+    const std::string key = upper(in.word("a section"));
+    if (key == "DATASET") {
+      if (upper(in.word("UNSTRUCTURED_GRID")) != "UNSTRUCTURED_GRID")
+        in.failHere("the data set is no UNSTRUCTURED_GRID; a tetrahedral mesh is needed");
+    } else if (key == "POINTS") {
+      readPoints(in, file);
+    } else if (key == "CELLS") {
+      if (!file.start.empty()) in.failHere("a second CELLS section; write the file anew");
+      readCellSection(in, file, version5);
+    } else if (key == "CELL_TYPES") {
+      readTypes(in, file);
+    } else if (key == "POINT_DATA" || key == "CELL_DATA") {
+      data = key == "POINT_DATA" ? &file.pointData : &file.cellData;
+      const std::size_t due = key == "POINT_DATA" ? file.points.size() : file.types.size();
+      count = in.count("data");
+      if (static_cast<std::size_t>(count) != due)
+        in.failHere(key + " is for " + std::to_string(count) + ", the mesh has " +
+                    std::to_string(due));
+    } else if (key == "FIELD") {
+      readField(in, *data);
+    } else if (key == "METADATA") {
+      in.line();
+      while (!in.consumed() && !in.line().empty()) continue;
+    } else if (!readAttribute(in, key, *data, count)) {
+      in.failHere("'" + key.substr(0, 40) +
+                  "' is no section of a VTK legacy mesh; the file is damaged");
+    }
+  }
+  if (file.start.size() != file.types.size() + 1 || file.types.empty())
+    in.failAsWhole("it has " + std::to_string(file.start.empty() ? 0 : file.start.size() - 1) +
+                   " cells and " + std::to_string(file.types.size()) +
+                   " cell types; the file is truncated or holds no mesh");
+  return file;
+}
+
+/// Puts the tetrahedra of the file into the mesh; returns the cell each came from.
+std::vector<int> takeTetrahedra(const VtkFile& file, Mesh& M, const Scanner& in) {
+  constexpr int tetrahedron = 10, lastPlane = 9;  // VTK's types 1 to 9 are points, lines and faces
+  std::vector<int> cell;
+  for (std::size_t c = 0; c < file.types.size(); ++c) {
+    const int type = file.types[c], size = file.start[c + 1] - file.start[c];
+    if (type >= 1 && type <= lastPlane) continue;
+    if (type != tetrahedron || size != 4)
+      in.failAsWhole("cell " + std::to_string(c) + " is of type " + std::to_string(type) +
+                     " with " + std::to_string(size) +
+                     " nodes; only tetrahedra (type 10) can be treated");
+    const int* n = &file.nodes[file.start[c]];
+    for (int i = 0; i < 4; ++i)
+      for (int j = 0; j < i; ++j)
+        if (n[i] == n[j]) in.failAsWhole("cell " + std::to_string(c) + " names a node twice");
+    M.tets.push_back({n[0], n[1], n[2], n[3]});
+    cell.push_back(static_cast<int>(c));
+  }
+  if (M.tets.empty()) in.failAsWhole("no tetrahedron in it; a tetrahedral mesh is needed");
+  return cell;
+}
+
+/// In the computational space the refinement edge z0 z1 is the longest, and z2 is farther from z0
+/// than z3 is: for all three types, as their edges show. So the file gives that order back.
+void orderForBisection(Mesh& M, const Scanner& in) {
+  // squares of the edges 01 02 03 12 13 23, by the cube's edge at this level
+  constexpr double kuhn[3][6] = {
+      {3, 2, 1, 1, 2, 1}, {2, 1, .75, 1, .75, .75}, {1, .75, .5, .75, .5, .25}};
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    std::array<int, 4>& z = M.tets[E];
+    auto edge2 = [&](int i, int j) { return norm2(M.xi[z[i]] - M.xi[z[j]]); };
+    if (edge2(0, 2) < edge2(0, 3)) std::swap(z[2], z[3]);
+    M.type.push_back(static_cast<unsigned char>(M.level[E] % 3));
+    const double* due = kuhn[M.type[E]];
+    const double cube = std::ldexp(1.0, -(M.level[E] / 3)), cube2 = cube * cube;
+    const double is[6] = {edge2(0, 1), edge2(0, 2), edge2(0, 3),
+                          edge2(1, 2), edge2(1, 3), edge2(2, 3)};
+    bool good = true;
+    for (int i = 0; i < 6; ++i) good &= is[i] == due[i] * cube2;  // exact: few binary digits
+    for (int n : z)
+      for (double t : {M.xi[n].x, M.xi[n].y, M.xi[n].z}) good &= std::remainder(t, .5 * cube) == 0;
+    if (!good)
+      in.failAsWhole("the computational coordinates of tetrahedron " + std::to_string(E) +
+                     " are not those of a bisected cube at its level " +
+                     std::to_string(M.level[E]) + "; use the file as meccano wrote it");
+  }
+}
+
+/// Finds the file's triangles among the faces, and refuses a boundary without its patches.
+void labelFaces(const VtkFile& file, Mesh& M, const Scanner& in) {
+  constexpr int triangle = 5;
+  using Key = std::array<int, 3>;
+  struct Labelled { Key key; int label, uses; };
+  std::vector<Labelled> faces;
+  Unpacking surface(file.cellData, "surface", 1, in);
+  std::vector<char> used(M.x.size(), 0);
+  for (std::size_t c = 0; c < file.types.size(); ++c) {
+    const int label = surface.integer(-static_cast<int>(M.patches.size()), INT_MAX);
+    if (file.types[c] != triangle || file.start[c + 1] - file.start[c] != 3) continue;
+    const int* n = &file.nodes[file.start[c]];
+    faces.push_back({{n[0], n[1], n[2]}, label, 0});
+    std::sort(faces.back().key.begin(), faces.back().key.end());
+    for (int i = 0; i < 3; ++i) used[n[i]] = 1;
+  }
+  auto less = [](const Labelled& a, const Labelled& b) { return a.key < b.key; };
+  std::sort(faces.begin(), faces.end(), less);
+  const std::vector<std::array<int, 4>> neighbour = faceNeighbours(M);
+  M.faceLabel.assign(M.tets.size(), {0, 0, 0, 0});
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 4>& z = M.tets[E];
+      Key key{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
+      const bool boundary = neighbour[E][i] < 0;
+      int label = 0;
+      if (used[key[0]] && used[key[1]] && used[key[2]]) {
+        std::sort(key.begin(), key.end());
+        const auto at = std::lower_bound(faces.begin(), faces.end(), Labelled{key, 0, 0}, less);
+        if (at != faces.end() && at->key == key) label = at->label, ++at->uses;
+      }
+      if (boundary != (label < 0))
+        in.failAsWhole("face " + std::to_string(i) + " of tetrahedron " + std::to_string(E) +
+                       (boundary ? " lies on the boundary, and no patch is named for it"
+                                 : " lies inside, and is named as one of the boundary") +
+                       "; use the file as meccano wrote it");
+      M.faceLabel[E][i] = label;
+    }
+  for (const Labelled& f : faces)  // one that is there twice has no use the second time
+    if (f.uses != (f.label > 0 ? 2 : 1))
+      in.failAsWhole("the triangle of nodes " + std::to_string(f.key[0]) + " " +
+                     std::to_string(f.key[1]) + " " + std::to_string(f.key[2]) +
+                     " is no face of the mesh, or there twice; use the file as meccano wrote it");
+}
+
+/// The data of the nodes; each entity must be one that the file has.
+void readNodes(const VtkFile& file, Mesh& M, const Scanner& in) {
+  const Arrays& data = file.pointData;
+  Unpacking xi(data, "computational", 3, in), dimension(data, "dimension", 1, in),
+      entity(data, "entity", 1, in), parameter(data, "parameter", 2, in);
+  const int patches = static_cast<int>(M.patches.size());
+  const int high[4] = {static_cast<int>(M.corners.size()), static_cast<int>(M.curves.size()),
+                       static_cast<int>(M.surfaces.size()), 0};
+  for (std::size_t n = 0; n < M.x.size(); ++n) {
+    M.xi.push_back(xi.vec3());
+    const int d = dimension.integer(0, 3);
+    M.dimension.push_back(static_cast<unsigned char>(d));
+    M.entity.push_back(entity.integer(d == 3 ? 0 : d == 2 ? -patches : 1, high[d]));
+    if (d < 3 && M.entity.back() == 0)
+      in.failAsWhole("node " + std::to_string(n) + " is on no surface, its dimension is 2");
+    M.parameter.push_back(parameter.vec2());
+  }
+}
+
+/// A mesh from a VTK legacy file: with its meccano where the file has one, else x and tets alone.
+Mesh parseVtk(const std::string& name, const std::string& text) {
+  Scanner in(name, text);
+  const bool version5 = text.compare(0, 24, "# vtk DataFile Version 5") == 0;
+  readHead(in);
+  const VtkFile file = readSections(in, version5);
+  Mesh M;
+  M.x = file.points;
+  const std::vector<int> cell = takeTetrahedra(file, M, in);
+  if (!file.field.count("cube") && !file.pointData.count("computational")) return M;
+  if (text.back() != '\n') in.failAsWhole("the last line is not complete; the file is truncated");
+  Unpacking cube(file.field, "cube", 3, in);
+  M.cube = cube.vec3();
+  unpackSurfaces(file.field, M, in);
+  unpackCurves(file.field, M, in);
+  unpackCorners(file.field, M, in);
+  readNodes(file, M, in);
+  constexpr int maxLevel = 250;
+  Unpacking level(file.cellData, "level", 1, in);
+  std::vector<int> levels;
+  for (std::size_t c = 0; c < file.types.size(); ++c) levels.push_back(level.integer(-1, maxLevel));
+  for (int c : cell) {
+    if (levels[c] < 0) in.failAsWhole("tetrahedron " + std::to_string(c) + " has no level");
+    M.level.push_back(static_cast<unsigned char>(levels[c]));
+  }
+  orderForBisection(M, in);
+  labelFaces(file, M, in);
+  return M;
+}
+
+/// As parseVtk; the errors of the library's own checks get the file's name.
+Mesh readMesh(const std::string& path) {
+  const std::string text = readFile(path);
+  try {
+    return parseVtk(path, text);
+  } catch (const Error& e) {
+    const std::string what = e.what();
+    throw InputError(what.compare(0, path.size(), path) == 0 ? what : path + ": " + what);
+  }
+}
+
+// ==== Arguments =================================================================================
+
+/// Wrong usage: exit status 2.
+struct UsageError : std::runtime_error { using std::runtime_error::runtime_error; };
+
+/// Standard output for results, standard error for progress and errors.
+struct Streams {
+  std::ostream& out;
+  std::ostream& err;
+  bool terminal;  // err is one: lines may be rewritten
+};
+
+struct Arguments {
+  std::vector<std::string> operands;
+  std::map<std::string, std::vector<std::string>> options;
+
+  bool has(const char* name) const { return options.count(name) > 0; }
+  template <class Number>
+  Number number(const char* name, Number otherwise, std::size_t i = 0) const {
+    const auto found = options.find(name);
+    if (found == options.end()) return otherwise;
+    Number value{};
+    if (!parse(found->second[i], value))
+      throw UsageError("'" + found->second[i] + "' is no " +
+                       (std::is_same_v<Number, int> ? "integer" : "number") + " for " + name);
+    if (!std::isfinite(double(value))) throw UsageError(std::string(name) + " must be finite");
+    return value;
+  }
+  Vec3 vec3(const char* name, Vec3 otherwise) const {
+    return {number(name, otherwise.x, 0), number(name, otherwise.y, 1),
+            number(name, otherwise.z, 2)};
+  }
+  /// The mesh to write: a .vtk file, or a device.
+  std::string output() const {
+    const auto found = options.find("-o");
+    if (found == options.end()) throw UsageError("the output is missing: -o OUT.vtk");
+    const std::string& path = found->second[0];
+    if (fs::path(path).extension() != ".vtk" && !isDevice(path))
+      throw UsageError("'" + path + "' does not end in .vtk, the format of the output");
+    return path;
+  }
+};
+
+// ==== Progress and tables =======================================================================
+
+/// Lines on standard error; while sweeping one that rewrites itself on a terminal.
+class Progress {
+ public:
+  Progress(const Streams& io, bool quiet) : io_(io), quiet_(quiet) {}
+  Progress(const Progress&) = delete;
+  Progress& operator=(const Progress&) = delete;
+  ~Progress() { endSweeps(); }
+  void line(const std::string& text) {
+    endSweeps();
+    if (!quiet_) io_.err << text << std::endl;
+  }
+  void sweep(const Sweep& s) {
+    if (quiet_ || !io_.terminal) return;
+    const char* pattern = "\r\033[Ksweep %d  inverted %d  min q %.4f  displacement %.2g";
+    io_.err << format(pattern, s.number, s.inverted, s.minQ, s.disp) << std::flush;
+    sweeping_ = true;
+  }
+  void warning(const std::string& text) {
+    endSweeps();
+    io_.err << "meccano: warning: " << text << std::endl;
+  }
+
+ private:
+  void endSweeps() {
+    if (sweeping_) io_.err << std::endl;
+    sweeping_ = false;
+  }
+  const Streams& io_;
+  bool quiet_, sweeping_ = false;
+};
+
+struct Column { const char* head; const QualityStatistics* q; };
+
+/// Table I: a column for each mesh.
+std::string tableI(const std::vector<Column>& columns) {
+  std::string text = format("%-12s", "Table I");
+  for (const Column& c : columns) text += format("%14s", c.head);
+  text += format("\n%-12s", "tetrahedra");
+  for (const Column& c : columns) text += format("%14d", c.q->tetrahedra);
+  text += format("\n%-12s", "inverted");
+  for (const Column& c : columns) text += format("%14d", c.q->inverted);
+  const std::pair<const char*, double QualityStatistics::*> rows[] = {
+      {"min", &QualityStatistics::min}, {"max", &QualityStatistics::max},
+      {"mean", &QualityStatistics::mean}, {"std dev", &QualityStatistics::stdDev}};
+  for (const auto& [name, member] : rows) {
+    text += format("\n%-12s", name);
+    for (const Column& c : columns) text += format("%14.4f", c.q->*member);
+  }
+  return text + "\n";
+}
+
+std::string regularLine(const QualityStatistics& q) {
+  return format("against the regular tetrahedron: inverted %d, min %.4f, max %.4f, mean %.4f, "
+                "std dev %.4f\n", q.inverted, q.min, q.max, q.mean, q.stdDev);
+}
+
+std::string sizeOf(const Mesh& M) {
+  return std::to_string(M.x.size()) + " nodes, " + std::to_string(M.tets.size()) + " tetrahedra";
+}
+
+// ==== Commands ==================================================================================
+
+void runBox(const Arguments& a, const Streams& io) {
+  const std::string path = a.output();
+  const std::array<int, 3> cells{a.number("--cells", 1, 0), a.number("--cells", 1, 1),
+                                 a.number("--cells", 1, 2)};
+  const Vec3 origin = a.vec3("--origin", {0, 0, 0}), size = a.vec3("--size", {1, 1, 1});
+  checkWritable(path);
+  const Mesh M = boxMesh(origin, size, cells);
+  writeFiles({{path, vtkText(M)}});
+  io.err << path << ": " << sizeOf(M) << std::endl;
+}
+
+/// What insertion needs of a mesh that was read.
+void checkInsertable(const std::string& path, const Mesh& M) {
+  if (M.xi.empty())
+    fail(path + ": the mesh has no computational coordinates, and bisection needs them; start from "
+         "`meccano box` or a .vtk file that meccano wrote");
+  int highest = 0;
+  for (const std::array<int, 4>& labels : M.faceLabel)
+    for (int label : labels) highest = std::max(highest, label);
+  if (highest > static_cast<int>(M.surfaces.size()))
+    fail(path + ": surface " + std::to_string(highest) + " is marked in it without its geometry, "
+         "as in the stages of an insertion; insert into a finished mesh");
+}
+
+void printInsertion(const InsertReport& r, const std::string& name, const Streams& io) {
+  io.out << tableI({{"original", &r.original}, {"refined", &r.refined},
+                    {"projected", &r.projected}, {"smoothed", &r.smoothed}})
+         << regularLine(r.regular)
+         << format("surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
+                   "%.3g, Hausdorff distance %.3g\n", r.surface, name.c_str(), r.lc, r.nodes,
+                   r.triangles, r.maxNodeDistance, r.hausdorff);
+}
+
+InsertOptions insertOptions(const Arguments& a) {
+  InsertOptions o = a.has("--paper") ? InsertOptions::paper() : InsertOptions{};
+  o.lc = a.number("--lc", o.lc);
+  o.maxTets = a.number("--max-tets", o.maxTets);
+  o.optimize.power = a.number("--power", o.optimize.power);
+  return o;
+}
+
+void runInsert(const Arguments& a, const Streams& io) {
+  const std::string path = a.output();
+  if (!a.has("--lc")) throw UsageError("the size is missing: --lc L");
+  InsertOptions options = insertOptions(a);
+  if (a.operands.size() > 2)
+    fail("insert: " + std::to_string(a.operands.size() - 1) +
+         " surfaces are given, and this version inserts one; name one");
+  const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
+  checkWritable(path);
+  if (!prefix.empty()) checkWritable(prefix + "-original.vtk");
+  Mesh M = readMesh(a.operands[0]);
+  checkInsertable(a.operands[0], M);
+  std::vector<std::string> warnings;
+  const TriangleSurface S = readSurface(a.operands[1], warnings);
+  Progress progress(io, a.has("--quiet"));
+  for (const std::string& w : warnings) progress.warning(w);
+  progress.line("mesh " + a.operands[0] + ": " + sizeOf(M));
+  progress.line("surface " + a.operands[1] + ": " + std::to_string(S.points.size()) + " points, " +
+                std::to_string(S.triangles.size()) + " triangles");
+  std::vector<Output> outputs;
+  auto keepStage = [&](const char* stage, const Mesh& mesh) {
+    if (!prefix.empty()) outputs.push_back({prefix + "-" + stage + ".vtk", vtkText(mesh)});
+  };
+  keepStage("original", M);
+  options.onStage = keepStage;
+  options.onProgress = [&](const std::string& line) { progress.line(line); };
+  options.optimize.onSweep = [&](const Sweep& s) { progress.sweep(s); };
+  const InsertReport report = insertSurface(M, S, options);
+  outputs.push_back({path, vtkText(M)});
+  writeFiles(outputs);
+  for (const std::string& w : report.warnings) progress.warning(w);
+  progress.line(path + ": " + sizeOf(M));
+  printInsertion(report, S.name, io);
+}
+
+OptimizeOptions optimizeOptions(const Arguments& a) {
+  OptimizeOptions o = a.has("--paper") ? OptimizeOptions::paper() : OptimizeOptions{};
+  o.maxDisp = a.number("--max-disp", o.maxDisp);
+  o.maxSweeps = a.number("--max-sweeps", o.maxSweeps);
+  o.power = a.number("--power", o.power);
+  return o;
+}
+
+void runOptimize(const Arguments& a, const Streams& io) {
+  const std::string path = a.output();
+  OptimizeOptions options = optimizeOptions(a);
+  checkWritable(path);
+  Mesh M = readMesh(a.operands[0]);
+  Progress progress(io, a.has("--quiet"));
+  progress.line("mesh " + a.operands[0] + ": " + sizeOf(M));
+  const QualityStatistics original = qualityStatistics(M);
+  options.onSweep = [&](const Sweep& s) { progress.sweep(s); };
+  const OptimizeReport r = optimizeMesh(M, options);
+  if (r.inverted > 0)
+    throw MethodError("optimize: " + std::to_string(r.inverted) +
+                      " elements are still inverted after " + std::to_string(r.sweeps) +
+                      " sweeps, nothing was written; raise --max-sweeps, or the boundary does not "
+                      "allow a valid mesh");
+  writeFiles({{path, vtkText(M)}});
+  const QualityStatistics smoothed = qualityStatistics(M);
+  progress.line(path + ": " + sizeOf(M));
+  io.out << tableI({{"original", &original}, {"smoothed", &smoothed}});
+  if (!M.xi.empty()) io.out << regularLine(qualityStatistics(M, Ideal::regular));
+  io.out << r.sweeps << " sweeps, displacement " << format("%.3g", r.disp)
+         << (r.converged ? ", converged\n" : ", stopped by --max-sweeps\n");
+}
+
+void runStats(const Arguments& a, const Streams& io) {
+  const Mesh M = readMesh(a.operands[0]);
+  const QualityStatistics regular = qualityStatistics(M, Ideal::regular);
+  io.out << a.operands[0] << ": " << sizeOf(M) << "\n";
+  for (std::size_t k = 1; k <= M.surfaces.size(); ++k)
+    io.out << "surface " << k << " (" << M.surfaces[k - 1].name
+           << "): " << surfaceFaces(M, static_cast<int>(k)).size() << " triangles\n";
+  if (M.xi.empty()) {
+    io.out << tableI({{"regular", &regular}});
+    return;
+  }
+  const QualityStatistics computational = qualityStatistics(M);
+  io.out << tableI({{"computational", &computational}, {"regular", &regular}});
+}
+
+// ==== Commands: their options and help ===========================================================
+
+struct Option {
+  const char* name;
+  const char* values;  // as the help shows them, separated by spaces; "" none
+  const char* help;
+};
+
+struct Command {
+  const char* name;
+  const char* operands;  // as the help shows them
+  const char* about;
+  std::size_t least, most;  // operands
+  std::vector<Option> options;
+  void (*run)(const Arguments&, const Streams&);
+};
+
+constexpr Option outputOption{"-o", "OUT.vtk", "the mesh to write"};
+constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
+constexpr Option powerOption{"--power", "P",
+                             "exponent of the last sweeps, for the worst elements (default 6)"};
+constexpr Option quietOption{"--quiet", "", "no progress on standard error"};
+
+const std::vector<Command>& commands() {
+  static const std::vector<Command> all{
+      {"box", "", "Makes the tetrahedral mesh of a box: six Kuhn tetrahedra for each cell.", 0, 0,
+       {outputOption,
+        {"--origin", "X Y Z", "lowest corner (default 0 0 0)"},
+        {"--size", "X Y Z", "edge lengths (default 1 1 1)"},
+        {"--cells", "NX NY NZ", "cells along each axis, near-cubic ones are best (default 1 1 1)"}},
+       runBox},
+      {"insert", "MESH.vtk SURFACE.obj",
+       "Inserts a triangulated surface into a mesh that meccano wrote, and prints Table I: the\n"
+       "quality of the original, refined, projected and smoothed mesh, against its computational\n"
+       "elements.", 2, 1000,
+       {outputOption,
+        {"--lc", "L", "element size at the surface, eq. (1), in the unit of the input"},
+        paperOption, powerOption,
+        {"--stages", "PREFIX", "also write PREFIX-{original,refined,projected,smoothed}.vtk"},
+        {"--max-tets", "N", "refuse where more tetrahedra are predicted (default 20000000)"},
+        quietOption},
+       runInsert},
+      {"optimize", "MESH.vtk",
+       "Untangles and smooths a tetrahedral mesh, Algorithm 2. The ideal elements are the\n"
+       "computational ones where the file has them; else regular, and the boundary stays in place.",
+       1, 1,
+       {outputOption,
+        {"--max-disp", "D", "stop below this displacement / shortest edge (default .01)"},
+        {"--max-sweeps", "N", "stop after this many sweeps (default 300)"},
+        paperOption, powerOption, quietOption},
+       runOptimize},
+      {"stats", "MESH.vtk", "Prints the quality statistics of a tetrahedral mesh, as in Table I.",
+       1, 1, {}, runStats}};
+  return all;
+}
+
+std::string usageLine(const Command& c) {
+  std::string line = std::string("meccano ") + c.name;
+  if (*c.operands) line += std::string(" ") + c.operands;
+  for (const Option& o : c.options) {
+    const std::string one = std::string(o.name) + (*o.values ? " " : "") + o.values;
+    const bool needed = std::string(o.name) == "-o" || std::string(o.name) == "--lc";
+    line += needed ? " " + one : " [" + one + "]";
+  }
+  return line;
+}
+
+std::string help(const Command& c) {
+  std::string text = "usage: " + usageLine(c) + "\n\n" + c.about + "\n";
+  if (!c.options.empty()) text += "\n";
+  for (const Option& o : c.options)
+    text += format("  %-20s %s\n", (std::string(o.name) + " " + o.values).c_str(), o.help);
+  return text;
+}
+
+std::string help() {
+  std::string text = std::string("meccano ") + version +
+                     ": insertion of triangulated surfaces into meccano tetrahedral meshes\n\n";
+  for (const Command& c : commands()) text += "  " + usageLine(c) + "\n";
+  return text +
+         "\n`meccano COMMAND --help` tells what a command does, `meccano --version` the version.\n"
+         "Results go to standard output, progress and errors to standard error.\n"
+         "Exit status: 0 done and valid, 1 an error and nothing written, 2 wrong usage.\n";
+}
+
+Arguments parseArguments(const Command& c, const std::vector<std::string>& words) {
+  Arguments a;
+  for (std::size_t i = 0; i < words.size(); ++i) {
+    const std::string& word = words[i];
+    if (word.empty() || word[0] != '-' || word == "-") {
+      a.operands.push_back(word);
+      continue;
+    }
+    const auto o = std::find_if(c.options.begin(), c.options.end(),
+                                [&](const Option& option) { return word == option.name; });
+    if (o == c.options.end()) throw UsageError("there is no option " + word);
+    if (a.has(o->name)) throw UsageError(word + " is given twice");
+    const std::string_view form = o->values;
+    const std::size_t values = form.empty() ? 0 : 1 + std::count(form.begin(), form.end(), ' ');
+    std::vector<std::string>& list = a.options[o->name];
+    for (; list.size() < values; list.push_back(words[++i]))
+      if (i + 1 == words.size() || words[i + 1].compare(0, 2, "--") == 0)
+        throw UsageError(word + " needs " + o->values);
+  }
+  if (a.operands.size() < c.least || a.operands.size() > c.most)
+    throw UsageError(c.most == 0 ? "'" + a.operands[0] + "' is too much, no file is read"
+                                 : std::string("needed: ") + c.operands + ", given: " +
+                                       std::to_string(a.operands.size()) + " files");
+  return a;
+}
+
+/// Does what the words after the program's name say; throws what goes wrong.
+void dispatch(const std::vector<std::string>& words, const Streams& io) {
+  if (words.empty()) throw UsageError("a command is missing");
+  auto asked = [&](const char* option) {
+    return std::find(words.begin(), words.end(), option) != words.end();
+  };
+  if (words[0] == "--version") {
+    io.out << "meccano " << version << "\n";
+    return;
+  }
+  if (words[0] == "--help" || words[0] == "-h") {
+    io.out << help();
+    return;
+  }
+  const auto c = std::find_if(commands().begin(), commands().end(),
+                              [&](const Command& command) { return words[0] == command.name; });
+  if (c == commands().end()) throw UsageError("there is no command '" + words[0] + "'");
+  if (asked("--help") || asked("-h")) {
+    io.out << help(*c);
+    return;
+  }
+  c->run(parseArguments(*c, {words.begin() + 1, words.end()}), io);
+}
+
+/// The program without its process: exit status 0 done and valid, 1 an error, 2 wrong usage.
+int run(const std::vector<std::string>& words, const Streams& io) {
+  try {
+    dispatch(words, io);
+    io.out.flush();
+    if (io.out) return 0;
+    io.err << "meccano: the results cannot be written to standard output" << std::endl;
+  } catch (const UsageError& e) {
+    const bool known = !words.empty() && words[0][0] != '-' && std::any_of(commands().begin(),
+        commands().end(), [&](const Command& c) { return words[0] == c.name; });
+    io.err << "meccano: " << (known ? words[0] + ": " : "") << e.what() << "; see meccano "
+           << (known ? words[0] + " " : "") << "--help" << std::endl;
+    return 2;
+  } catch (const std::bad_alloc&) {
+    io.err << "meccano: the memory does not suffice; use a larger --lc or a coarser mesh\n";
+  } catch (const std::exception& e) {
+    io.err << "meccano: " << e.what() << std::endl;
+  }
+  return 1;
+}
+
+}  // namespace meccano::app
+
+#ifndef MECCANO_NO_MAIN
+int main(int argc, char** argv) {
+  const meccano::app::Streams io{std::cout, std::cerr, ::isatty(2) == 1};
+  return meccano::app::run({argv + (argc > 0), argv + argc}, io);
+}
+#endif

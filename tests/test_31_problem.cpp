@@ -1,0 +1,395 @@
+// SPDX-License-Identifier: MIT
+// §3.1: what a surface must be, and the distance tools of §3.2 and §3.4.
+#include "../meccano.hpp"
+
+#include <doctest/doctest.h>
+
+#include <cmath>
+#include <limits>
+#include <string>
+#include <vector>
+
+using namespace meccano;
+
+namespace {
+
+/// The text of the InputError that checkSurface throws; empty if it throws none.
+std::string refusal(const TriangleSurface& S) {
+  std::vector<std::string> warnings;
+  try {
+    checkSurface(S, warnings);
+  } catch (const InputError& error) {
+    return error.what();
+  }
+  return "";
+}
+
+bool contains(const std::string& text, const std::string& part) {
+  CAPTURE(text);
+  CAPTURE(part);
+  bool found = text.find(part) != std::string::npos;
+  CHECK(found);
+  return found;
+}
+
+/// A bent grid of n x m cells without symmetry, two triangles per cell, normals upwards.
+TriangleSurface bentGrid(int n, int m) {
+  TriangleSurface S;
+  for (int j = 0; j <= m; ++j)
+    for (int i = 0; i <= n; ++i) {
+      double x = 1.1 * i / n, y = .9 * j / m;
+      S.points.push_back({x, y, .3 * std::sin(2.5 * x + .4) * std::cos(1.7 * y)});
+    }
+  for (int j = 0; j < m; ++j)
+    for (int i = 0; i < n; ++i) {
+      int a = j * (n + 1) + i, b = a + 1, c = b + n + 1, d = a + n + 1;
+      if ((i + j) % 2 == 0) {
+        S.triangles.push_back({a, b, c});
+        S.triangles.push_back({a, c, d});
+      } else {
+        S.triangles.push_back({a, b, d});
+        S.triangles.push_back({b, c, d});
+      }
+    }
+  return S;
+}
+
+/// A ring of n quadrilaterals, its ends joined with a half turn (Möbius) or without (annulus).
+TriangleSurface band(int n, bool halfTurn) {
+  TriangleSurface S;
+  for (int i = 0; i < n; ++i) {
+    double t = 2 * 3.14159265358979 * i / n, tilt = halfTurn ? t / 2 : .3;
+    for (int side : {-1, 1}) {
+      double r = 1 + .3 * side * std::cos(tilt);
+      S.points.push_back({r * std::cos(t), r * std::sin(t), .3 * side * std::sin(tilt)});
+    }
+  }
+  for (int i = 0; i < n; ++i) {
+    int a = 2 * i, b = a + 1, c = 2 * ((i + 1) % n), d = c + 1;
+    if (halfTurn && i == n - 1) std::swap(c, d);
+    S.triangles.push_back({a, b, c});
+    S.triangles.push_back({b, d, c});
+  }
+  return S;
+}
+
+/// A torus of n x m quadrilaterals, with the last one cut out: one rim, one handle.
+TriangleSurface cutTorus(int n, int m) {
+  TriangleSurface S;
+  for (int j = 0; j < m; ++j)
+    for (int i = 0; i < n; ++i) {
+      double s = 6.283185307 * i / n, t = 6.283185307 * j / m, r = 2 + .7 * std::cos(t);
+      S.points.push_back({r * std::cos(s), r * std::sin(s), .7 * std::sin(t)});
+    }
+  for (int j = 0; j < m; ++j)
+    for (int i = 0; i < n; ++i) {
+      if (i == n - 1 && j == m - 1) continue;
+      int a = j * n + i, b = j * n + (i + 1) % n, d = (j + 1) % m * n + i;
+      int c = (j + 1) % m * n + (i + 1) % n;
+      S.triangles.push_back({a, b, c});
+      S.triangles.push_back({a, c, d});
+    }
+  return S;
+}
+
+TriangleSurface tetrahedronHull() {
+  return {{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {0, 0, 1}},
+          {{0, 2, 1}, {0, 1, 3}, {1, 2, 3}, {0, 3, 2}}};
+}
+
+/// Points in and around the unit box, the same in every run.
+std::vector<Vec3> scatteredPoints(int count) {
+  std::vector<Vec3> points;
+  unsigned state = 7;
+  auto next = [&] {
+    state = state * 1664525u + 1013904223u;
+    return 2 * ((state >> 8) / double(1 << 24)) - .5;
+  };
+  for (int i = 0; i < count; ++i) {
+    double x = next(), y = next();
+    points.push_back({x, y, next()});
+  }
+  return points;
+}
+
+/// Distance to a triangle by ternary search over its barycentric coordinates: slow, needs no cases.
+double searchedDistance(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
+  auto along = [&](double s) {
+    Vec3 p = a + s * (b - a), q = a + s * (c - a);
+    double lo = 0, hi = 1;
+    for (int i = 0; i < 100; ++i) {
+      double t1 = lo + (hi - lo) / 3, t2 = hi - (hi - lo) / 3;
+      if (norm(x - (p + t1 * (q - p))) < norm(x - (p + t2 * (q - p)))) hi = t2;
+      else lo = t1;
+    }
+    return norm(x - (p + lo * (q - p)));
+  };
+  double lo = 0, hi = 1;
+  for (int i = 0; i < 100; ++i) {
+    double s1 = lo + (hi - lo) / 3, s2 = hi - (hi - lo) / 3;
+    if (along(s1) < along(s2)) hi = s2;
+    else lo = s1;
+  }
+  return along(lo);
+}
+
+}  // namespace
+
+TEST_SUITE("3.1") {
+  TEST_CASE("a disk passes unchanged and without warnings") {
+    TriangleSurface S = bentGrid(4, 3);
+    S.name = "bent";
+    std::vector<std::string> warnings;
+    TriangleSurface C = checkSurface(S, warnings);
+    CHECK(warnings.empty());
+    CHECK(C.name == "bent");
+    CHECK(C.points.size() == S.points.size());
+    CHECK(C.triangles == S.triangles);
+  }
+
+  TEST_CASE("coincident points are welded, so a triangle soup is a disk") {
+    TriangleSurface S = bentGrid(4, 3), soup;
+    for (const std::array<int, 3>& t : S.triangles) {
+      int n = static_cast<int>(soup.points.size());
+      for (int i : t) soup.points.push_back(S.points[i]);
+      soup.triangles.push_back({n, n + 1, n + 2});
+    }
+    std::vector<std::string> warnings;
+    TriangleSurface C = checkSurface(soup, warnings);
+    CHECK(C.points.size() == S.points.size());
+    CHECK(C.triangles.size() == S.triangles.size());
+    CHECK(warnings.empty());
+  }
+
+  TEST_CASE("minus zero and zero are one point") {
+    TriangleSurface S{{{0., 0, 0}, {1, 0, 0}, {0, 1, 0}, {-0., 0, 0}, {-1, .5, 0}},
+                      {{0, 1, 2}, {3, 2, 4}}};
+    std::vector<std::string> warnings;
+    CHECK(checkSurface(S, warnings).points.size() == 4);
+  }
+
+  TEST_CASE("duplicate and zero-area triangles and unused points are dropped and counted") {
+    TriangleSurface S = bentGrid(4, 3);
+    S.triangles.push_back(S.triangles[5]);
+    S.triangles.push_back({S.triangles[2][1], S.triangles[2][0], S.triangles[2][2]});
+    S.triangles.push_back({0, 1, 1});
+    S.points.push_back({9, 9, 9});
+    std::vector<std::string> warnings;
+    TriangleSurface C = checkSurface(S, warnings);
+    CHECK(C.triangles.size() == S.triangles.size() - 3);
+    CHECK(C.points.size() == S.points.size() - 1);
+    REQUIRE(warnings.size() == 1);
+    contains(warnings[0], "2 duplicate triangles, 1 zero-area triangle and 1 unused point");
+  }
+
+  TEST_CASE("triangles that disagree are turned, the minority of them") {
+    TriangleSurface S = bentGrid(4, 3), mixed = S;
+    for (int t : {0, 7, 8}) std::swap(mixed.triangles[t][0], mixed.triangles[t][1]);
+    std::vector<std::string> warnings;
+    TriangleSurface C = checkSurface(mixed, warnings);
+    REQUIRE(warnings.size() == 1);
+    contains(warnings[0], "turned 3 triangles");
+    for (const std::array<int, 3>& t : C.triangles)
+      CHECK(cross(C.points[t[1]] - C.points[t[0]], C.points[t[2]] - C.points[t[0]]).z > 0);
+  }
+
+  TEST_CASE("refused: empty, or nothing but zero areas") {
+    contains(refusal({}), "insertSurface (§3.1): the surface is empty; give at least one triangle");
+    contains(refusal({{{0, 0, 0}, {1, 1, 1}, {2, 2, 2}}, {{0, 1, 2}}}),
+             "all its 1 triangles have zero area");
+  }
+
+  TEST_CASE("refused: an index out of range") {
+    TriangleSurface S = bentGrid(2, 2);
+    S.triangles[3][1] = 9;
+    contains(refusal(S), "triangle 3 names point 9, but there are 9 points");
+    S.triangles[3][1] = -1;
+    contains(refusal(S), "triangle 3 names point -1");
+  }
+
+  TEST_CASE("refused: a coordinate that is not finite") {
+    for (double bad :
+         {std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {
+      TriangleSurface S = bentGrid(2, 2);
+      S.points[4].y = bad;
+      contains(refusal(S), "point 4 has the coordinates");
+    }
+  }
+
+  TEST_CASE("refused: a non-manifold edge, with its three triangles") {
+    TriangleSurface S = bentGrid(2, 2);
+    S.points.push_back({.5, .5, 2});
+    S.triangles.push_back({0, 4, 9});
+    std::string text = refusal(S);
+    contains(text, "is non-manifold: triangles 0, 1 and 8 share it");
+    contains(text, "the edge from (0, 0, ");
+  }
+
+  TEST_CASE("refused: a non-manifold vertex") {
+    TriangleSurface S{{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {-1, 0, 0}, {0, -1, 0}},
+                      {{0, 1, 2}, {0, 3, 4}}};
+    contains(refusal(S), "the point (0, 0, 0) is non-manifold: triangles 0 and 1 meet only there");
+  }
+
+  TEST_CASE("refused: several components") {
+    TriangleSurface S = bentGrid(2, 2);
+    for (Vec3 p : {Vec3{5, 0, 0}, Vec3{6, 0, 0}, Vec3{5, 1, 0}}) S.points.push_back(p);
+    S.triangles.push_back({9, 10, 11});
+    contains(refusal(S), "2 components (the largest of 8, the smallest of 1 triangles)");
+  }
+
+  TEST_CASE("refused: closed") {
+    contains(refusal(tetrahedronHull()), "the surface is closed (4 triangles, no rim)");
+  }
+
+  TEST_CASE("refused: holes") {
+    TriangleSurface S = bentGrid(6, 6);
+    S.triangles.erase(S.triangles.begin() + 28);
+    contains(refusal(S), "the surface has holes: 2 rims, the shortest of 3 edges at (");
+    contains(refusal(band(9, false)), "2 rims");
+  }
+
+  TEST_CASE("refused: not orientable") {
+    contains(refusal(band(9, true)), "not orientable (a Moebius band)");
+  }
+
+  TEST_CASE("refused: a handle") {
+    contains(refusal(cutTorus(7, 5)), "1 handle (Euler characteristic -1, a disk has 1)");
+  }
+
+  TEST_CASE("rimLoops: one loop with S on its left") {
+    TriangleSurface S = bentGrid(4, 3);
+    std::vector<std::vector<int>> rims = rimLoops(S);
+    REQUIRE(rims.size() == 1);
+    CHECK(rims[0].size() == 14);
+    double area = 0;  // of the shadow on z = 0
+    for (size_t i = 0; i < rims[0].size(); ++i)
+      area += .5 * cross(S.points[rims[0][i]], S.points[rims[0][(i + 1) % rims[0].size()]]).z;
+    CHECK(area == doctest::Approx(1.1 * .9));
+  }
+}
+
+TEST_SUITE("3.2") {
+  TEST_CASE("the nearest point of the tree is that of brute force") {
+    TriangleSurface S = bentGrid(9, 7);
+    TriangleTree tree(S.points, S.triangles);
+    for (Vec3 x : scatteredPoints(100)) {
+      double least = 1e9;
+      for (const std::array<int, 3>& t : S.triangles)
+        least = std::min(
+            least,
+            closestPointOnTriangle(x, S.points[t[0]], S.points[t[1]], S.points[t[2]]).distance);
+      ClosestPoint p = tree.closest(x);
+      CHECK(p.distance == least);
+      const std::array<int, 3>& t = S.triangles[p.triangle];
+      Vec3 fromWeights =
+          p.w[0] * S.points[t[0]] + p.w[1] * S.points[t[1]] + p.w[2] * S.points[t[2]];
+      CHECK(norm(fromWeights - p.point) < 1e-14);
+      CHECK(tree.closest(x, .5 * least).triangle == -1);
+    }
+  }
+
+  TEST_CASE("the nearest point of a triangle is that of a search, for needles too") {
+    for (double height : {.7, 1e-3, 1e-9}) {
+      CAPTURE(height);
+      Vec3 a{.1, .2, .3}, b{1.2, .1, .4}, c = .4 * a + .6 * b + Vec3{0, height, 0};
+      for (Vec3 x : scatteredPoints(10))
+        CHECK(closestPointOnTriangle(x, a, b, c).distance ==
+              doctest::Approx(searchedDistance(x, a, b, c)).epsilon(1e-9));
+    }
+  }
+
+  TEST_CASE("visit finds every triangle whose box meets a box, and stops when told") {
+    TriangleSurface S = bentGrid(9, 7);
+    TriangleTree tree(S.points, S.triangles);
+    Vec3 lo{.3, .2, -1}, hi{.5, .6, 1};
+    std::vector<int> found, expected;
+    tree.visit(lo, hi, [&](int t) {
+      found.push_back(t);
+      return false;
+    });
+    std::sort(found.begin(), found.end());
+    for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
+      TriangleTree::Box box{{1e9, 1e9, 1e9}, {-1e9, -1e9, -1e9}};
+      for (int n : S.triangles[t]) {
+        Vec3 p = S.points[n];
+        box.lo = {std::min(box.lo.x, p.x), std::min(box.lo.y, p.y), std::min(box.lo.z, p.z)};
+        box.hi = {std::max(box.hi.x, p.x), std::max(box.hi.y, p.y), std::max(box.hi.z, p.z)};
+      }
+      if (boxesMeet(box, lo, hi)) expected.push_back(t);
+    }
+    CHECK(found == expected);
+    int visited = 0;
+    tree.visit(lo, hi, [&](int) { return ++visited == 3; });
+    CHECK(visited == 3);
+  }
+
+  TEST_CASE("eq. (1), dist(dM, S): smallestGap of two triangle sets") {
+    TriangleSurface S = bentGrid(9, 7);
+    TriangleTree tree(S.points, S.triangles);
+    TriangleSurface above = S;
+    for (Vec3& p : above.points) p = {p.x, p.y, p.z + 5};
+    above.points[17].z =
+        S.points[17].z + .25;  // the tip of a spike, nearest to S's vertex 17 or a face beside it
+    Gap gap = smallestGap(tree, above.points, above.triangles);
+    CHECK(gap.distance <= .25);
+    CHECK(gap.distance == doctest::Approx(tree.closest(above.points[17]).distance).epsilon(1e-12));
+    CHECK(tree.triangle.size() == S.triangles.size());
+    CHECK(gap.triangle >= 0);
+    CHECK(gap.other >= 0);
+  }
+
+  TEST_CASE("smallestGap of crossing edges, and 0 where a triangle pierces another") {
+    TriangleTree tree({{-1, 0, 0}, {1, 0, 0}, {0, -1, -2}}, {{0, 1, 2}});
+    CHECK(smallestGap(tree, {{0, -1, .5}, {0, 1, .5}, {0, 0, 3}}, {{0, 1, 2}}).distance ==
+          doctest::Approx(.5));
+    CHECK(smallestGap(tree, {{0, -5, -1}, {0, 5, -1}, {0, 1, 3}}, {{0, 1, 2}}).distance == 0);
+  }
+
+  TEST_CASE("Hausdorff distance is two-sided") {
+    TriangleTree small({{0, 0, 0}, {1, 0, 0}, {0, 1, 0}}, {{0, 1, 2}});
+    TriangleTree large({{0, 0, .5}, {3, 0, .5}, {0, 3, .5}}, {{0, 1, 2}});
+    CHECK(hausdorffDistance(small, small, 4) == 0);
+    CHECK(hausdorffDistance(small, large, 4) == doctest::Approx(std::sqrt(4 + .25)));
+    CHECK(hausdorffDistance(large, small, 4) == hausdorffDistance(small, large, 4));
+    CHECK_THROWS_AS(hausdorffDistance(small, large, 0), InputError);
+  }
+}
+
+TEST_SUITE("3.4") {
+  TEST_CASE("side: the sign of the shift, on faces, edges and vertices of a sharply bent surface") {
+    // A roof: ridge and vertices would get the wrong side from the normal of any one triangle.
+    TriangleSurface S{{{0, 0, 0}, {2, 0, 0}, {2, .2, 2}, {0, .2, 2}, {2, .4, 0}, {0, .4, 0}},
+                      {{0, 1, 2}, {0, 2, 3}, {3, 2, 4}, {3, 4, 5}}};
+    SurfaceDistance D(S);
+    auto outside = [&](Vec3 x) { return D.query(x).side > 0; };
+    for (double x : {.3, 1., 1.9}) {
+      CHECK(outside({x, .2, 2.3}));
+      CHECK(outside({x, -.2, 2.05}));
+      CHECK(outside({x, .6, 2.05}));
+      CHECK_FALSE(outside({x, .2, 1.5}));
+      CHECK(std::fabs(D.query({x, .2, 2.3}).side) == doctest::Approx(.3));
+      CHECK_FALSE(D.query({x, .2, 2.3}).onRim);
+    }
+  }
+
+  TEST_CASE("beyond the rim the surface goes on tangentially") {
+    TriangleSurface S{{{0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}}, {{0, 1, 2}, {0, 2, 3}}};
+    SurfaceDistance D(S);
+    SurfaceQuery beside = D.query({1.5, .4, .25}), beyondCorner = D.query({-3, -4, -.5});
+    CHECK(beside.onRim);
+    CHECK(beside.side == doctest::Approx(.25));
+    CHECK(beside.excess == doctest::Approx(.5));
+    CHECK(beyondCorner.side == doctest::Approx(-.5));
+    CHECK(beyondCorner.excess == doctest::Approx(5));
+    SurfaceQuery above = D.query({.5, .25, .125});
+    CHECK_FALSE(above.onRim);
+    CHECK(above.excess == 0);
+    CHECK(D.rimDistance({.5, .25, 0}) == doctest::Approx(.25));
+    CHECK(D.rimDistance({.5, .5, 2}) == doctest::Approx(std::sqrt(4.25)));
+  }
+
+  TEST_CASE("SurfaceDistance refuses what has not one rim") {
+    CHECK_THROWS_AS(SurfaceDistance{tetrahedronHull()}, InputError);
+  }
+}

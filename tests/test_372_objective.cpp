@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: MIT
+//
+// §3.7.2: the objective function of a node and its analytic derivatives.
+#include <doctest/doctest.h>
+
+#include "shapes.hpp"
+
+using namespace meccano;
+
+namespace {
+
+const std::vector<int> allEight{0, 1, 2, 3, 4, 5, 6, 7};
+constexpr int inner = 6;
+
+/// Eq. (9) element by element from the mesh, without a star.
+double slowF(Mesh M, Vec3 x, double delta, double power) {
+  M.x[inner] = x;
+  double sum = 0;
+  for (const std::array<int, 4>& t : M.tets) {
+    const Mat3 J = jacobian({M.xi[t[0]], M.xi[t[1]], M.xi[t[2]], M.xi[t[3]]},
+                            {M.x[t[0]], M.x[t[1]], M.x[t[2]], M.x[t[3]]});
+    sum += std::pow(etaRegularized(J, delta), power);
+  }
+  return sum;
+}
+
+/// Orders of the Taylor remainders of f, without and with the Hessian, from step to step/2.
+struct Rates {
+  double gradient, hessian;
+};
+Rates taylorRates(const Star& star, Vec3 x, double delta, double power, double step) {
+  const Objective o = fDerivatives(star, x, delta, power);
+  const Vec3 d = (1 / std::sqrt(3.)) * Vec3{1, -1, 1};
+  double first[2], second[2];
+  for (int k = 0; k < 2; ++k) {
+    const double t = k == 0 ? step : step / 2;
+    const double change = f(star, x + t * d, delta, power) - o.f;
+    first[k] = std::abs(change - t * dot(o.gradient, d));
+    second[k] = std::abs(change - t * dot(o.gradient, d) - t * t / 2 * dot(d, o.hessian * d));
+  }
+  return {std::log2(first[0] / first[1]), std::log2(second[0] / second[1])};
+}
+
+}  // namespace
+
+TEST_SUITE("3.7.2") {
+  TEST_CASE("eq. (9): the star's closed form agrees with the sum over the elements") {
+    const Mesh M = shapes::unsymmetricStar();
+    const Star star = starOf(M, inner, allEight);
+    REQUIRE(star.elements.size() == 8);
+    for (Vec3 x : {M.x[inner], Vec3{.3, -.2, .4}, Vec3{2, .5, -1}})
+      for (double delta : {.05, 1.})
+        for (double power : {1., 3., 6., 2.5, 24.}) {
+          CAPTURE(power);
+          CAPTURE(delta);
+          CHECK(f(star, x, delta, power) ==
+                doctest::Approx(slowF(M, x, delta, power)).epsilon(1e-11));
+          CHECK(fDerivatives(star, x, delta, power).f ==
+                doctest::Approx(f(star, x, delta, power)).epsilon(1e-13));
+        }
+    CHECK(f(star, M.x[inner], 0) == doctest::Approx(slowF(M, M.x[inner], 0, 1)).epsilon(1e-13));
+  }
+
+  TEST_CASE("eq. (9): f is infinite without regularization where an element is inverted") {
+    const Star star = starOf(shapes::unsymmetricStar(), inner, allEight);
+    CHECK(std::isinf(f(star, {2, 0, 0}, 0)));
+    CHECK(std::isfinite(f(star, {2, 0, 0}, 1e-3)));
+  }
+
+  TEST_CASE("eq. (9): gradient and Hessian by the rate of the Taylor remainder") {
+    const Mesh M = shapes::unsymmetricStar();
+    const Star star = starOf(M, inner, allEight);
+    for (double power : {1., 6., 24., 2.5}) {
+      CAPTURE(power);
+      for (double delta : {0., .1}) {
+        CAPTURE(delta);
+        const Rates r = taylorRates(star, {.2, .15, .1}, delta, power, power > 10 ? 2e-4 : 1e-3);
+        CHECK(r.gradient == doctest::Approx(2).epsilon(.05));
+        CHECK(r.hessian == doctest::Approx(3).epsilon(.08));
+      }
+      const Rates inverted = taylorRates(star, {2, .3, -.2}, .3, power, power > 10 ? 2e-4 : 1e-3);
+      CHECK(inverted.gradient == doctest::Approx(2).epsilon(.05));
+      CHECK(inverted.hessian == doctest::Approx(3).epsilon(.08));
+    }
+  }
+
+  TEST_CASE("eq. (9): the gradient agrees with central differences to 1e-7") {
+    const Mesh M = shapes::unsymmetricStar();
+    const Star star = starOf(M, inner, allEight);
+    const double e = 1e-5;
+    for (Vec3 x : {Vec3{.2, .15, .1}, Vec3{2, .3, -.2}}) {
+      const Objective o = fDerivatives(star, x, .2);
+      const Vec3 g{(f(star, x + Vec3{e, 0, 0}, .2) - f(star, x - Vec3{e, 0, 0}, .2)) / (2 * e),
+                   (f(star, x + Vec3{0, e, 0}, .2) - f(star, x - Vec3{0, e, 0}, .2)) / (2 * e),
+                   (f(star, x + Vec3{0, 0, e}, .2) - f(star, x - Vec3{0, 0, e}, .2)) / (2 * e)};
+      CHECK(norm(g - o.gradient) < 1e-7 * norm(g));
+    }
+  }
+
+  TEST_CASE("eq. (9): the Hessian of a valid star is positive definite at delta = 0") {
+    const Mesh M = shapes::unsymmetricStar();
+    const Star star = starOf(M, inner, allEight);
+    for (Vec3 x : {M.x[inner], Vec3{.2, .15, .1}, Vec3{-.2, 0, .2}}) {
+      REQUIRE(std::isfinite(f(star, x, 0)));
+      Vec3 p;
+      const Objective o = fDerivatives(star, x, 0, 6);
+      REQUIRE(solveCholesky(o.hessian, -o.gradient, p));
+      CHECK(dot(p, o.gradient) < 0);
+    }
+  }
+
+  TEST_CASE("solveCholesky solves a definite system and refuses an indefinite one") {
+    const Mat3 A{{4, 1, -.5}, {1, 3, .7}, {-.5, .7, 2}};
+    const Vec3 b{1, -2, 3};
+    Vec3 p;
+    REQUIRE(solveCholesky(A, b, p));
+    CHECK(norm(A * p - b) < 1e-14);
+    CHECK_FALSE(solveCholesky({{4, 1, 0}, {1, -3, 0}, {0, 0, 2}}, b, p));
+    CHECK_FALSE(solveCholesky({{1, 1, 0}, {1, 1, 0}, {0, 0, 2}}, b, p));  // singular
+    CHECK_FALSE(solveCholesky({{-1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, b, p));
+    CHECK_FALSE(solveCholesky({{std::nan(""), 0, 0}, {0, 1, 0}, {0, 0, 1}}, b, p));
+  }
+}

@@ -1,0 +1,343 @@
+// SPDX-License-Identifier: MIT
+//
+// §3.7.4: line search, Algorithm 2, untangling, errors.
+#include <doctest/doctest.h>
+
+#include <cstring>
+
+#include "shapes.hpp"
+
+using namespace meccano;
+
+namespace {
+
+constexpr double inf = std::numeric_limits<double>::infinity();
+
+bool onHull(Vec3 x) {
+  const auto end = [](double t) { return t < 1e-12 || t > 1 - 1e-12; };
+  return end(x.x) || end(x.y) || end(x.z);
+}
+
+/// A Kuhn cube without geometry, its inner nodes shaken by up to `amount` cell edges (splitmix64).
+Mesh shakenCube(int n, double amount) {
+  const Mesh box = boxMesh({0, 0, 0}, {1, 1, 1}, {n, n, n});
+  Mesh M;
+  M.x = box.x;
+  M.xi = box.xi;
+  M.tets = box.tets;
+  std::uint64_t state = 1;
+  const auto random = [&state]() {
+    std::uint64_t z = state += 0x9E3779B97F4A7C15u;
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9u;
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
+    return 2 * std::ldexp(static_cast<double>((z ^ (z >> 31)) >> 11), -53) - 1;
+  };
+  for (Vec3& x : M.x) {
+    if (onHull(x)) continue;
+    const double a = random(), b = random(), c = random();
+    x += (amount / n) * Vec3{a, b, c};
+  }
+  return M;
+}
+
+/// An inner block of a Kuhn cube turned about a skew axis; the block's nodes are to be fixed.
+Mesh turnedCube(int n, int lo, int hi, double angle, std::vector<int>& block) {
+  Mesh M = shakenCube(n, 0);
+  const Vec3 k = (1 / std::sqrt(14.)) * Vec3{1, 2, 3}, centre{.5, .5, .5};
+  for (std::size_t i = 0; i < M.x.size(); ++i) {
+    const Vec3 d = M.x[i] - centre;
+    const double bottom = (lo - .5) / n - .5, top = (hi + .5) / n - .5;
+    if (std::min({d.x, d.y, d.z}) < bottom || std::max({d.x, d.y, d.z}) > top) continue;
+    block.push_back(static_cast<int>(i));
+    M.x[i] = centre + std::cos(angle) * d + std::sin(angle) * cross(k, d) +
+             ((1 - std::cos(angle)) * dot(k, d)) * k;
+  }
+  return M;
+}
+
+/// F with derivative for the line search; counts its calls.
+struct LineCase {
+  const char* name;
+  LinePoint (*F)(double);
+  double tFirst;
+};
+const LineCase lineCases[] = {
+    {"parabola",
+     [](double t) {
+       return LinePoint{(t - 1) * (t - 1), 2 * (t - 1)};
+     },
+     1},
+    {"far parabola",
+     [](double t) {
+       return LinePoint{(t - 30) * (t - 30), 2 * (t - 30)};
+     },
+     1},
+    {"near parabola",
+     [](double t) {
+       return LinePoint{(t - .01) * (t - .01), 2 * (t - .01)};
+     },
+     1},
+    {"pole at 1",
+     [](double t) {
+       return t < 1 ? LinePoint{1 / (1 - t) - 3 * t, 1 / ((1 - t) * (1 - t)) - 3}
+                    : LinePoint{inf, 0};
+     },
+     1},
+    {"barrier",
+     [](double t) {
+       return t < .1 ? LinePoint{-std::log(.1 - t) - 30 * t, 1 / (.1 - t) - 30} : LinePoint{inf, 0};
+     },
+     1},
+    {"wave",
+     [](double t) {
+       return LinePoint{std::cos(3 * t) - .2 * std::sin(t) - 1,
+                        -3 * std::sin(3 * t) - .2 * std::cos(t)};
+     },
+     1},
+};
+
+template <class E, class Call>
+std::string messageOf(Call call) {
+  try {
+    call();
+  } catch (const E& error) {
+    return error.what();
+  }
+  return "";
+}
+
+bool contains(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
+
+}  // namespace
+
+TEST_SUITE("3.7.4") {
+  TEST_CASE("strong Wolfe: both inequalities hold at the accepted step") {
+    for (const LineCase& c : lineCases) {
+      CAPTURE(c.name);
+      const WolfeStep step = strongWolfe(c.F, c.tFirst, inf);
+      REQUIRE(step.t > 0);
+      const LinePoint zero = c.F(0), at = c.F(step.t);
+      CHECK(step.armijo);
+      CHECK(step.curvature);
+      CHECK(at.F <= zero.F + 1e-4 * step.t * zero.slope);
+      CHECK(std::abs(at.slope) <= .9 * std::abs(zero.slope));
+      CHECK(step.evaluations <= 20);
+    }
+  }
+
+  TEST_CASE("strong Wolfe: a good first step costs one evaluation") {
+    CHECK(strongWolfe(lineCases[0].F, 1, inf).evaluations == 1);
+  }
+
+  TEST_CASE("strong Wolfe: the step stays below tMax, and there Armijo suffices") {
+    const WolfeStep step = strongWolfe(lineCases[1].F, 1, 2);
+    CHECK(step.t == 2);
+    CHECK(step.armijo);
+  }
+
+  TEST_CASE("strong Wolfe: t = 0 where F only grows") {
+    const WolfeStep step = strongWolfe([](double t) { return LinePoint{t * t + t, -1}; }, 1, inf);
+    CHECK(step.t == 0);
+    CHECK_FALSE(step.armijo);
+    CHECK(step.evaluations == 20);
+  }
+
+  TEST_CASE("Algorithm 2: a shaken cube becomes the ideal mesh, its boundary stays") {
+    for (double amount : {.45, .9}) {
+      CAPTURE(amount);
+      Mesh M = shakenCube(8, amount);
+      const Mesh before = M;
+      REQUIRE(qualityStatistics(M).inverted > 0);
+      const OptimizeReport report = optimizeMesh(M);
+      CHECK(report.converged);
+      CHECK(report.inverted == 0);
+      CHECK(report.minQ > .999);
+      for (std::size_t n = 0; n < M.x.size(); ++n)
+        if (onHull(before.x[n])) CHECK(M.x[n] == before.x[n]);
+      CHECK(report.minQ == qualityStatistics(M).min);
+      CHECK(report.meanQ == qualityStatistics(M).mean);
+    }
+  }
+
+  TEST_CASE("Algorithm 2: to the letter it reaches the same") {
+    Mesh M = shakenCube(6, .5);
+    const OptimizeReport report = optimizeMesh(M, OptimizeOptions::paper());
+    CHECK(report.converged);
+    CHECK(report.inverted == 0);
+    CHECK(report.minQ > .99);
+  }
+
+  TEST_CASE("Algorithm 2: position and scale do not matter") {
+    Mesh A = shakenCube(6, .5), B = A;
+    for (Vec3& x : B.x) x = 1e3 * x + Vec3{4e5, 4e6, -1e3};
+    const OptimizeReport a = optimizeMesh(A), b = optimizeMesh(B);
+    CHECK(a.inverted == 0);
+    CHECK(b.inverted == 0);
+    CHECK(a.meanQ == doctest::Approx(b.meanQ).epsilon(1e-4));
+  }
+
+  TEST_CASE("Algorithm 2: an inner cube turned inside a fixed hull is untangled") {
+    for (double angle : {1.2, 2.2, 3.}) {
+      CAPTURE(angle);
+      OptimizeOptions options;
+      Mesh M = turnedCube(8, 3, 5, angle, options.fixed);
+      const Mesh before = M;
+      REQUIRE(qualityStatistics(M).inverted > 0);
+      const OptimizeReport report = optimizeMesh(M, options);
+      CHECK(report.inverted == 0);
+      CHECK(report.minQ > 0);
+      for (int n : options.fixed) CHECK(M.x[n] == before.x[n]);
+    }
+  }
+
+  TEST_CASE("Algorithm 2: f never grows in a visit, and a valid star stays valid") {
+    // Only node 6 of the star is free: each sweep is one visit of it.
+    Mesh M = shapes::unsymmetricStar();
+    const Star star = starOf(M, 6, {0, 1, 2, 3, 4, 5, 6, 7});
+    double last = f(star, M.x[6], 0);
+    REQUIRE(std::isfinite(last));
+    for (int k = 0; k < 20; ++k) {
+      OptimizeOptions once;
+      once.maxSweeps = 1;
+      once.power = 1;
+      CHECK(optimizeMesh(M, once).inverted == 0);
+      const double now = f(star, M.x[6], 0);
+      CHECK(now <= last * (1 + 1e-13));
+      last = now;
+    }
+    CHECK(norm(fDerivatives(star, M.x[6], 0).gradient) < 1e-2);  // and ends at the minimum
+  }
+
+  TEST_CASE("Algorithm 2: a valid mesh is valid after every sweep") {
+    Mesh M = shakenCube(6, .12);
+    REQUIRE(qualityStatistics(M).inverted == 0);
+    OptimizeOptions options;
+    int sweeps = 0, inverted = 0;
+    options.onSweep = [&](const Sweep& sweep) {
+      CHECK(sweep.number == ++sweeps);
+      inverted += sweep.inverted;
+    };
+    const OptimizeReport report = optimizeMesh(M, options);
+    CHECK(report.sweeps == sweeps);
+    CHECK(inverted == 0);
+  }
+
+  TEST_CASE(
+      "Algorithm 2: departure, the worst elements are lifted and the mean falls by at most .02") {
+    std::vector<int> block;
+    const Mesh start = turnedCube(8, 3, 5, .7, block);
+    OptimizeOptions options, plain;
+    options.fixed = plain.fixed = block;
+    plain.power = 1;
+    Mesh A = start, B = start;
+    const OptimizeReport lifted = optimizeMesh(A, options), sum = optimizeMesh(B, plain);
+    CHECK(lifted.minQ > sum.minQ + .02);
+    CHECK(lifted.meanQ > sum.meanQ - .02);
+  }
+
+  TEST_CASE("Algorithm 2: maxSweeps bounds all phases") {
+    for (int bound : {1, 5, 70}) {
+      std::vector<int> block;
+      Mesh M = turnedCube(8, 3, 5, 3, block);
+      OptimizeOptions options;
+      options.fixed = block;
+      options.maxSweeps = bound;
+      CHECK(optimizeMesh(M, options).sweeps <= bound);
+    }
+  }
+
+  TEST_CASE("Algorithm 2: nodes whose stars rest are not visited") {
+    Mesh M = shakenCube(6, 0);
+    int moved = -1;
+    for (std::size_t n = 0; n < M.x.size(); ++n)
+      if (norm(M.x[n] - Vec3{.5, .5, .5}) < 1e-9) moved = static_cast<int>(n);
+    REQUIRE(moved >= 0);
+    M.x[moved].x += .05;
+    const Mesh before = M;
+    OptimizeOptions options;
+    options.power = 1;
+    options.active = {0};  // a corner: nothing wakes the others
+    CHECK(optimizeMesh(M, options).converged);
+    CHECK(std::memcmp(M.x.data(), before.x.data(), sizeof(Vec3) * M.x.size()) == 0);
+    options.active = {moved};
+    optimizeMesh(M, options);
+    CHECK(norm(M.x[moved] - Vec3{.5, .5, .5}) < 1e-3);
+  }
+
+  TEST_CASE("Algorithm 2: two runs give the same bytes") {
+    std::vector<int> block;
+    Mesh A = turnedCube(8, 3, 5, 2.2, block), B = A;
+    OptimizeOptions options;
+    options.fixed = block;
+    optimizeMesh(A, options);
+    optimizeMesh(B, options);
+    CHECK(std::memcmp(A.x.data(), B.x.data(), sizeof(Vec3) * A.x.size()) == 0);
+  }
+
+  TEST_CASE("Algorithm 2: a mesh without tetrahedra or without free nodes is left as it is") {
+    Mesh none;
+    CHECK(optimizeMesh(none).converged);
+    Mesh one = shapes::oneTetrahedron();
+    const std::vector<Vec3> before = one.x;
+    const OptimizeReport report = optimizeMesh(one);
+    CHECK(report.converged);
+    CHECK(report.inverted == 0);
+    CHECK(one.x == before);
+  }
+
+  TEST_CASE("errors: options out of range") {
+    Mesh M = shakenCube(2, .1);
+    const auto refuses = [&M](const char* part, void (*change)(OptimizeOptions&)) {
+      CAPTURE(part);
+      OptimizeOptions options;
+      change(options);
+      const Mesh before = M;
+      const std::string text = messageOf<InputError>([&] { optimizeMesh(M, options); });
+      CHECK(contains(text, "optimizeMesh (§3.7)"));
+      CHECK(contains(text, part));
+      CHECK(M.x == before.x);
+    };
+    refuses("maxDisp", [](OptimizeOptions& o) { o.maxDisp = 0; });
+    refuses("maxDisp", [](OptimizeOptions& o) { o.maxDisp = std::nan(""); });
+    refuses("maxSweeps = 0", [](OptimizeOptions& o) { o.maxSweeps = 0; });
+    refuses("power", [](OptimizeOptions& o) { o.power = .5; });
+    refuses("mu", [](OptimizeOptions& o) { o.mu = 1; });
+    refuses("mu", [](OptimizeOptions& o) { o.mu = 0; });
+    refuses("relaxation", [](OptimizeOptions& o) { o.relaxation = 2; });
+    refuses("fixed node 27", [](OptimizeOptions& o) { o.fixed = {27}; });
+    refuses("active node -1", [](OptimizeOptions& o) { o.active = {-1}; });
+  }
+
+  TEST_CASE("errors: malformed meshes") {
+    const auto refuses = [](const char* part, void (*change)(Mesh&)) {
+      CAPTURE(part);
+      Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2});
+      change(M);
+      CHECK(contains(messageOf<InputError>([&] { optimizeMesh(M); }), part));
+    };
+    refuses("tetrahedron 3 names node 99", [](Mesh& M) { M.tets[3][1] = 99; });
+    refuses("names node -1", [](Mesh& M) { M.tets[0][0] = -1; });
+    refuses("node 5 has a coordinate that is not finite", [](Mesh& M) { M.x[5].y = std::nan(""); });
+    refuses("node 6 has a computational", [](Mesh& M) { M.xi[6].z = inf; });
+    refuses("M.xi has 26 entries", [](Mesh& M) { M.xi.pop_back(); });
+    refuses("M.dimension has", [](Mesh& M) { M.dimension.pop_back(); });
+    refuses("M.entity has", [](Mesh& M) { M.entity.pop_back(); });
+    refuses("M.parameter has", [](Mesh& M) { M.parameter.clear(); });
+    refuses("dimension 4", [](Mesh& M) { M.dimension[13] = 4; });
+    refuses("no surface or patch 7", [](Mesh& M) {
+      M.dimension[13] = 2;
+      M.entity[13] = 7;
+    });
+    refuses("no curve 40", [](Mesh& M) {
+      M.dimension[13] = 1;
+      M.entity[13] = 40;
+    });
+    refuses("call buildLocator()", [](Mesh& M) {
+      for (auto& P : M.patches) P.gridSize = 0;
+    });
+    refuses("its ideal element is degenerate",
+            [](Mesh& M) { M.xi[M.tets[2][0]] = M.xi[M.tets[2][1]]; });
+  }
+}

@@ -1,0 +1,84 @@
+// SPDX-License-Identifier: MIT
+//
+// §4, Table I: statistics of the quality.
+#include <doctest/doctest.h>
+
+#include <numeric>
+
+#include "shapes.hpp"
+
+using namespace meccano;
+
+TEST_SUITE("Table I") {
+  TEST_CASE("Table I: an undeformed meccano has q = 1 everywhere, before and after bisection") {
+    Mesh M = boxMesh({3, 4, 5}, {2, 2, 2}, {2, 2, 2});
+    const double regular[3] = {.7559526, .7619525, .8};
+    for (int level = 0; level < 3; ++level) {
+      CAPTURE(level);
+      const QualityStatistics q = qualityStatistics(M), r = qualityStatistics(M, Ideal::regular);
+      CHECK(q.tetrahedra == static_cast<int>(M.tets.size()));
+      CHECK(q.inverted == 0);
+      CHECK(q.min == doctest::Approx(1).epsilon(1e-13));
+      CHECK(q.max == doctest::Approx(1).epsilon(1e-13));
+      CHECK(q.stdDev < 1e-13);
+      CHECK(r.inverted == 0);
+      CHECK(r.min == doctest::Approx(regular[level]).epsilon(1e-6));
+      CHECK(r.mean == doctest::Approx(regular[level]).epsilon(1e-6));
+      std::vector<int> all(M.tets.size());
+      std::iota(all.begin(), all.end(), 0);
+      bisect(M, all);
+    }
+  }
+
+  TEST_CASE("Table I: inverted elements count with q = 0") {
+    Mesh M = shapes::unsymmetricStar();
+    M.x[6] = {2, .1, .1};  // outside the octahedron
+    const std::vector<double> q = qualities(M);
+    const QualityStatistics table = qualityStatistics(M);
+    int zeros = 0;
+    for (std::size_t E = 0; E < q.size(); ++E) {
+      zeros += q[E] == 0;
+      CHECK((q[E] == 0) ==
+            (shapes::orientation(M.x, M.tets[E]) != shapes::orientation(M.xi, M.tets[E])));
+    }
+    CHECK(zeros > 0);
+    CHECK(table.inverted == zeros);
+    CHECK(table.min == 0);
+  }
+
+  TEST_CASE("Table I: min, max, mean, standard deviation, histogram") {
+    Mesh M = shapes::unsymmetricStar();
+    const std::vector<double> q = qualities(M);
+    const QualityStatistics table = qualityStatistics(M);
+    double mean = 0, square = 0;
+    std::array<int, 20> histogram{};
+    for (double value : q) {
+      mean += value / 8;
+      square += value * value / 8;
+      for (int i = 0; i < 20; ++i)
+        if (value >= i / 20. && (value < (i + 1) / 20. || i == 19)) ++histogram[i];
+    }
+    CHECK(table.mean == doctest::Approx(mean).epsilon(1e-14));
+    CHECK(table.stdDev == doctest::Approx(std::sqrt(square - mean * mean)).epsilon(1e-9));
+    CHECK(table.min == *std::min_element(q.begin(), q.end()));
+    CHECK(table.max == *std::max_element(q.begin(), q.end()));
+    CHECK(table.min < table.max);
+    CHECK(table.histogram == histogram);
+  }
+
+  TEST_CASE(
+      "Table I: without computational coordinates the ideal is regular, in either orientation") {
+    Mesh M = shapes::twoTetrahedra();
+    const QualityStatistics table = qualityStatistics(M);
+    CHECK(table.mean == qualityStatistics(M, Ideal::regular).mean);
+    CHECK(table.min > 0);
+    for (auto& t : M.tets) std::swap(t[0], t[1]);
+    CHECK(qualityStatistics(M).min == doctest::Approx(table.min).epsilon(1e-13));
+  }
+
+  TEST_CASE("Table I: no elements, all zero") {
+    const QualityStatistics table = qualityStatistics(Mesh{});
+    CHECK(table.tetrahedra == 0);
+    CHECK(table.mean == 0);
+  }
+}
