@@ -18,8 +18,6 @@ namespace meccano {
 
 namespace {
 
-constexpr double infinity = std::numeric_limits<double>::infinity();
-
 /// A double as messages print it.
 std::string number(double value) {
   char text[32];
@@ -990,7 +988,7 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
   return C.S;
 }
 
-// ---- Tools for 3.2 and 3.4: distance to S ------------------------------------------------------
+// ==== Tools for 3.2 and 3.4: distance to S ======================================================
 
 namespace {
 
@@ -1337,7 +1335,1020 @@ double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int sampl
   return std::max(sampledDistance(A, B, samplesPerEdge), sampledDistance(B, A, samplesPerEdge));
 }
 
-// ---- Tools for 3.6: sparse iterative solver ----------------------------------------------------
+// ==== Tools for 3.2: triangle–tetrahedron intersection ===========================================
+
+bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle) {
+  constexpr double tolerance = 1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
+  constexpr int faces[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+  Vec3 polygon[8], clipped[8];  // three corners and at most one more for each plane
+  int corners = 3;
+  for (int i = 0; i < 3; ++i) polygon[i] = triangle[i];
+  for (int i = 0; i < 4; ++i) {
+    const Vec3 a = tet[faces[i][0]], b = tet[faces[i][1]], c = tet[faces[i][2]];
+    Vec3 inward = cross(b - a, c - a);
+    const double height = dot(inward, tet[i] - a);
+    inward = (1 / height) * inward;  // 0 on the face, 1 at the opposite vertex
+    int kept = 0;
+    for (int j = 0; j < corners; ++j) {
+      const Vec3 p = polygon[j], q = polygon[(j + 1) % corners];
+      const double dp = dot(inward, p - a) + tolerance, dq = dot(inward, q - a) + tolerance;
+      if (dp >= 0) clipped[kept++] = p;
+      if ((dp > 0 && dq < 0) || (dp < 0 && dq > 0)) clipped[kept++] = p + dp / (dp - dq) * (q - p);
+    }
+    if (kept == 0) return false;
+    corners = kept;
+    std::copy(clipped, clipped + kept, polygon);
+  }
+  return true;
+}
+
+// ==== 3.2 Volumetric approximation ===============================================================
+
+double longestEdge(const Mesh& M, int E) {
+  double longest = 0;
+  for (int i = 0; i < 4; ++i)
+    for (int j = 0; j < i; ++j) {
+      const Vec3 d = M.xi[M.tets[E][i]] - M.xi[M.tets[E][j]];
+      longest = std::max(longest, norm(Vec3{d.x * M.cube.x, d.y * M.cube.y, d.z * M.cube.z}));
+    }
+  return longest;
+}
+
+bool isTooLarge(const Mesh& M, int E, double lc) { return longestEdge(M, E) >= lc; }
+
+namespace {
+
+/// Whether S meets tetrahedron E: candidates by the tree, then by clipping.
+bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
+  std::array<Vec3, 4> tet;
+  for (int i = 0; i < 4; ++i) tet[i] = M.x[M.tets[E][i]];
+  Vec3 lo = tet[0], hi = tet[0];
+  for (const Vec3& p : tet) {
+    lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
+    hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
+  }
+  const Vec3 margin = 1e-9 * (hi - lo);
+  bool hit = false;
+  S.tree.visit(lo - margin, hi + margin, [&](int t) {
+    const std::array<int, 3>& v = S.S.triangles[t];
+    return hit = intersects(tet, {S.S.points[v[0]], S.S.points[v[1]], S.S.points[v[2]]});
+  });
+  return hit;
+}
+
+enum class Cut : char { unknown, yes, no };
+
+/// Tells of each tetrahedron not yet known whether S cuts it.
+void classify(const Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut) {
+  cut.resize(B.M.tets.size(), Cut::unknown);
+  for (std::size_t E = 0; E < cut.size(); ++E)
+    if (cut[E] == Cut::unknown)
+      cut[E] = meetsSurface(B.M, static_cast<int>(E), S) ? Cut::yes : Cut::no;
+}
+
+/// Refines the tetrahedra cut by S that `wanted` asks for until there is none.
+template <class Wanted>
+void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wanted wanted) {
+  constexpr int maxPasses = 250;  // one level a pass; levels fit in a byte
+  for (int pass = 0; pass < maxPasses; ++pass) {
+    classify(B, S, cut);
+    std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
+    for (std::size_t E = 0; E < cut.size(); ++E)
+      if (cut[E] == Cut::yes && wanted(static_cast<int>(E)))
+        refine.push_back({static_cast<int>(E), B.M.level[E]});
+    if (refine.empty()) return;
+    B.splits.clear();
+    for (const auto& [E, level] : refine)
+      if (B.M.level[E] == level) B.bisect(E);
+    cut.resize(B.M.tets.size(), Cut::unknown);
+    for (const auto& [parent, child] : B.splits) cut[parent] = cut[child] = Cut::unknown;
+  }
+}
+
+}  // namespace
+
+Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc) {
+  std::vector<Cut> cut;
+  refineCut(B, S, cut, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
+  // The level of whole cubes that §3.3 completes T to; T reaches it already here.
+  Approximation A;
+  for (std::size_t E = 0; E < cut.size(); ++E)
+    if (cut[E] == Cut::yes) A.level = std::max(A.level, (B.M.level[E] + 2) / 3 * 3);
+  refineCut(B, S, cut, [&](int E) { return B.M.level[E] < A.level; });
+  A.T.resize(cut.size());
+  for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E] == Cut::yes;
+  return A;
+}
+
+// ==== Tools for 3.3: the lattice of cubes ========================================================
+
+namespace {
+
+/// The cubes of one level in the computational space. Keys are positions in half cubes: odd, odd, odd
+/// is a cube's centre; even, odd, odd a square's; even, even, even a node.
+struct Lattice {
+  double scale;  // cubes per unit of ξ
+  explicit Lattice(int level) : scale(std::ldexp(1., level / 3)) {}
+  static std::uint64_t key(std::array<std::int64_t, 3> half) {
+    return std::uint64_t(half[0]) << 42 | std::uint64_t(half[1]) << 21 | std::uint64_t(half[2]);
+  }
+  static std::array<std::int64_t, 3> position(std::uint64_t key) {
+    constexpr std::uint64_t mask = (1u << 21) - 1;
+    return {std::int64_t(key >> 42), std::int64_t(key >> 21 & mask), std::int64_t(key & mask)};
+  }
+  std::int64_t inside(double c) const { return 2 * std::int64_t(std::floor(c * scale)) + 1; }
+  bool onPlane(double c) const { return c * scale == std::floor(c * scale); }
+  std::uint64_t cubeOf(const Mesh& M, int E) const {
+    const std::array<int, 4>& z = M.tets[E];
+    const Vec3 c = .25 * (M.xi[z[0]] + M.xi[z[1]] + M.xi[z[2]] + M.xi[z[3]]);
+    return key({inside(c.x), inside(c.y), inside(c.z)});
+  }
+  bool isNode(Vec3 xi) const { return onPlane(xi.x) && onPlane(xi.y) && onPlane(xi.z); }
+  std::uint64_t node(Vec3 xi) const {
+    return key({std::int64_t(2 * xi.x * scale), std::int64_t(2 * xi.y * scale),
+                std::int64_t(2 * xi.z * scale)});
+  }
+  /// The square that holds the face; false where the face is inside a cube.
+  bool squareOf(const Mesh& M, std::array<int, 3> face, std::array<std::int64_t, 3>& half) const {
+    const Vec3 a = M.xi[face[0]], b = M.xi[face[1]], c = M.xi[face[2]];
+    const Vec3 middle = (1. / 3) * (a + b + c);
+    half = {inside(middle.x), inside(middle.y), inside(middle.z)};
+    if (a.x == b.x && a.x == c.x && onPlane(a.x)) return half[0] = std::int64_t(2 * a.x * scale), true;
+    if (a.y == b.y && a.y == c.y && onPlane(a.y)) return half[1] = std::int64_t(2 * a.y * scale), true;
+    if (a.z == b.z && a.z == c.z && onPlane(a.z)) return half[2] = std::int64_t(2 * a.z * scale), true;
+    return false;
+  }
+};
+
+std::array<int, 3> faceOpposite(const std::array<int, 4>& z, int i) {
+  return {z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
+}
+
+}  // namespace
+
+// ==== 3.3 Volumetric approximation healing =======================================================
+
+int chi(int nE, int nF, int nC) { return nE - nF + nC; }
+
+int chi(unsigned cubes) {
+  int nE = 0, nF = 0, nC = 0;
+  for (int c = 0; c < 8; ++c) nC += cubes >> c & 1;
+  // edges: the half axes; faces: the quarter planes; each belongs to T with any cube that has it
+  for (int axis = 0; axis < 3; ++axis)
+    for (int side = 0; side < 2; ++side) {
+      bool edge = false;
+      for (int c = 0; c < 8; ++c) edge |= (c >> axis & 1) == side && (cubes >> c & 1);
+      nE += edge;
+      for (int other = 0; other < 2; ++other) {
+        const int axis2 = (axis + 1) % 3;
+        bool face = false;
+        for (int c = 0; c < 8; ++c)
+          face |= (c >> axis & 1) == side && (c >> axis2 & 1) == other && (cubes >> c & 1);
+        nF += face;
+      }
+    }
+  return chi(nE, nF, nC);
+}
+
+bool isFaceConnected(unsigned cubes) {
+  unsigned reached = cubes & -cubes;
+  for (int round = 0; round < 8; ++round)
+    for (int c = 0; c < 8; ++c)
+      for (int axis = 0; axis < 3; ++axis)
+        if ((reached >> c & 1) && (cubes >> (c ^ 1 << axis) & 1)) reached |= 1u << (c ^ 1 << axis);
+  return reached == cubes;
+}
+
+bool isLocalDisk(unsigned cubes) {
+  return cubes == 255 || cubes == 0 ||
+         (chi(cubes) == 1 && isFaceConnected(cubes) && isFaceConnected(255u & ~cubes));
+}
+
+namespace {
+
+/// Adds to T whatever shares a cube with an element of it: a boundary face of T that is not on the
+/// lattice's planes has its neighbour refined to the same level and added.
+void completeCubes(Bisection& B, Approximation& A, std::vector<int> queue) {
+  const Lattice lattice(A.level);
+  std::array<std::int64_t, 3> square;
+  for (std::size_t at = 0; at < queue.size(); ++at)
+    for (int i = 0; i < 4; ++i) {
+      const int E = queue[at];
+      if (lattice.squareOf(B.M, faceOpposite(B.M.tets[E], i), square)) continue;
+      while (B.M.level[B.neighbour[E][i]] < A.level) B.bisect(B.neighbour[E][i]);
+      A.T.resize(B.M.tets.size(), 0);
+      const int next = B.neighbour[E][i];
+      if (A.T[next]) continue;
+      A.T[next] = 1;
+      queue.push_back(next);
+    }
+}
+
+std::vector<int> elementsOf(const std::vector<char>& T) {
+  std::vector<int> elements;
+  for (std::size_t E = 0; E < T.size(); ++E)
+    if (T[E]) elements.push_back(static_cast<int>(E));
+  return elements;
+}
+
+/// For each lattice node of T the cubes of T around it: bit 1 x+, bit 2 y+, bit 4 z+ of the cube's place.
+KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint64_t>& nodes) {
+  const Lattice lattice(A.level);
+  KeyMap cubes, at;
+  for (int E : elementsOf(A.T)) {
+    const std::uint64_t key = lattice.cubeOf(M, E);
+    if (cubes[key]++) continue;
+    const std::array<std::int64_t, 3> p = Lattice::position(key);
+    for (int c = 0; c < 8; ++c) {
+      // seen from its corner at side c the cube lies on the other side
+      const std::uint64_t node = Lattice::key(
+          {p[0] + (c & 1 ? 1 : -1), p[1] + (c & 2 ? 1 : -1), p[2] + (c & 4 ? 1 : -1)});
+      int& mask = at[node];
+      if (mask == 0) nodes.push_back(node);
+      mask |= 1 << (7 - c);
+    }
+  }
+  return at;
+}
+
+/// The elements adjacent to the node, refined to T's level, join T.
+void addElementsAt(Bisection& B, Approximation& A, int node) {
+  std::vector<int> around, added;
+  for (bool coarse = true; coarse;) {
+    coarse = false;
+    B.star(node, around);
+    for (int E : around)
+      if (B.M.level[E] < A.level) {
+        B.bisect(E);
+        coarse = true;
+        break;
+      }
+  }
+  A.T.resize(B.M.tets.size(), 0);
+  for (int E : around)
+    if (!A.T[E]) {
+      A.T[E] = 1;
+      added.push_back(E);
+    }
+  completeCubes(B, A, added);
+}
+
+}  // namespace
+
+void volumetricHealing(Bisection& B, Approximation& A) {
+  constexpr int maxRounds = 200;
+  completeCubes(B, A, elementsOf(A.T));
+  const Lattice lattice(A.level);
+  for (int round = 0; round < maxRounds; ++round) {
+    std::vector<std::uint64_t> keys;
+    const KeyMap cubes = cubesAtNodes(B.M, A, keys);
+    KeyMap meshNode(keys.size());
+    for (int E : elementsOf(A.T))
+      for (int n : B.M.tets[E])
+        if (lattice.isNode(B.M.xi[n])) meshNode[lattice.node(B.M.xi[n])] = n;
+    std::vector<int> bad;
+    for (std::uint64_t key : keys)
+      if (!isLocalDisk(cubes.get(key))) bad.push_back(meshNode.get(key));
+    if (bad.empty()) return;
+    for (int n : bad) {
+      if (B.M.dimension[n] < 3)
+        throw MethodError("insertSurface (§3.3): T reaches the boundary or another surface at node " +
+                          std::to_string(n) + "; lower l_c");
+      addElementsAt(B, A, n);
+    }
+  }
+  throw MethodError("insertSurface (§3.3): T has no boundary that is a surface after " +
+                    std::to_string(maxRounds) + " rounds; lower l_c");
+}
+
+// ==== 3.4 Surface extraction =====================================================================
+
+namespace {
+
+/// The longest edge of a face in the computational space: the one that bisection splits first.
+std::pair<int, int> refinementEdge(const Mesh& M, std::array<int, 3> face) {
+  std::pair<int, int> longest{face[0], face[1]};
+  double length = 0;
+  for (int e = 0; e < 3; ++e) {
+    const double l = norm2(M.xi[face[(e + 1) % 3]] - M.xi[face[e]]);
+    if (l > length) length = l, longest = {face[e], face[(e + 1) % 3]};
+  }
+  return longest;
+}
+
+/// The squares of ∂T: faces of cubes in T whose other cube is not, counter-clockwise from outside.
+void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, SquareSurface& Q) {
+  const Lattice lattice(A.level);
+  KeyMap inside;
+  std::vector<std::uint64_t> cubes;
+  for (int E : elementsOf(A.T)) {
+    const std::uint64_t key = lattice.cubeOf(M, E);
+    if (!inside[key]++) cubes.push_back(key);
+  }
+  for (std::uint64_t key : cubes) {
+    const std::array<std::int64_t, 3> cube = Lattice::position(key);
+    for (int axis = 0; axis < 3; ++axis)
+      for (int side = -1; side <= 1; side += 2) {
+        std::array<std::int64_t, 3> beyond = cube, centre = cube;
+        beyond[axis] += 2 * side;
+        centre[axis] += side;
+        if (inside.get(Lattice::key(beyond))) continue;
+        const int a1 = (axis + (side > 0 ? 1 : 2)) % 3, a2 = (axis + (side > 0 ? 2 : 1)) % 3;
+        constexpr int around[4][2] = {{-1, -1}, {1, -1}, {1, 1}, {-1, 1}};
+        Square s;
+        for (int e = 0; e < 4; ++e) {
+          std::array<std::int64_t, 3> corner = centre;
+          corner[a1] += around[e][0];
+          corner[a2] += around[e][1];
+          s.node[e] = meshNode.get(Lattice::key(corner)) - 1;
+        }
+        s.centre = .25 * (M.x[s.node[0]] + M.x[s.node[1]] + M.x[s.node[2]] + M.x[s.node[3]]);
+        Q.squares.push_back(s);
+        Q.keys.push_back(Lattice::key(centre));
+      }
+  }
+}
+
+/// Joins the squares along their edges; each edge of ∂T has two.
+void joinSquares(SquareSurface& Q) {
+  KeyMap first(2 * Q.squares.size());  // edge → 1 + 4 square + side of the first square that has it
+  for (std::size_t i = 0; i < Q.squares.size(); ++i)
+    for (int e = 0; e < 4; ++e) {
+      Square& s = Q.squares[i];
+      int& other = first[edgeKey(s.node[e], s.node[(e + 1) % 4])];
+      if (other == 0) {
+        other = 1 + 4 * static_cast<int>(i) + e;
+        continue;
+      }
+      const int j = (other - 1) / 4, g = (other - 1) % 4;
+      s.across[e] = j, s.acrossEdge[e] = g;
+      Q.squares[j].across[g] = static_cast<int>(i), Q.squares[j].acrossEdge[g] = e;
+    }
+}
+
+/// Which diagonal of each square is an edge of the mesh: the longest edge of its faces. (Bisection reflects
+/// the cubes: it is not Kuhn's lowest to highest corner.)
+void findDiagonals(const Mesh& M, const Approximation& A, SquareSurface& Q) {
+  const Lattice lattice(A.level);
+  KeyMap squareAt(Q.keys.size());
+  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
+  std::array<std::int64_t, 3> half;
+  for (int E : elementsOf(A.T))
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 3> face = faceOpposite(M.tets[E], i);
+      if (!lattice.squareOf(M, face, half)) continue;
+      const int square = squareAt.get(Lattice::key(half)) - 1;
+      if (square < 0) continue;
+      Square& s = Q.squares[square];
+      const std::pair<int, int> edge = refinementEdge(M, face);
+      for (int d = 0; d < 2; ++d)
+        if (edgeKey(edge.first, edge.second) == edgeKey(s.node[d], s.node[d + 2])) s.diagonal = d;
+    }
+}
+
+/// Squares around each node: (square, corner) in compressed rows over the nodes of ∂T.
+void collectNodes(SquareSurface& Q, int meshNodes) {
+  Q.start.assign(meshNodes + 1, 0);
+  for (const Square& s : Q.squares)
+    for (int n : s.node) ++Q.start[n + 1];
+  for (int n = 0; n < meshNodes; ++n)
+    if (Q.start[n + 1] > 0) Q.nodes.push_back(n);
+  std::partial_sum(Q.start.begin(), Q.start.end(), Q.start.begin());
+  Q.around.resize(Q.start.back());
+  std::vector<int> next(Q.start.begin(), Q.start.end() - 1);
+  for (std::size_t i = 0; i < Q.squares.size(); ++i)
+    for (int e = 0; e < 4; ++e)
+      Q.around[next[Q.squares[i].node[e]]++] = {static_cast<int>(i), e};
+}
+
+}  // namespace
+
+SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
+  const Lattice lattice(A.level);
+  SquareSurface Q;
+  Q.level = A.level;
+  Q.h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) / lattice.scale;
+  KeyMap meshNode;
+  for (int E : elementsOf(A.T))
+    for (int n : M.tets[E])
+      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
+  addSquares(M, A, meshNode, Q);
+  joinSquares(Q);
+  findDiagonals(M, A, Q);
+  collectNodes(Q, static_cast<int>(M.x.size()));
+
+  // ∂T must be one sphere: V − E + F = 2 with E = 2 F, and connected.
+  const int euler = static_cast<int>(Q.nodes.size()) - static_cast<int>(Q.squares.size());
+  std::vector<int> part(1, 0);
+  std::vector<char> seen(Q.squares.size(), 0);
+  if (!seen.empty()) seen[0] = 1;
+  for (std::size_t i = 0; i < part.size() && !seen.empty(); ++i)
+    for (int next : Q.squares[part[i]].across)
+      if (!seen[next]) seen[next] = 1, part.push_back(next);
+  if (euler != 2 || part.size() != Q.squares.size())
+    throw MethodError("insertSurface (§3.3): the boundary of T is no sphere (chi = " +
+                      std::to_string(euler) + ", " + std::to_string(part.size()) + " of " +
+                      std::to_string(Q.squares.size()) +
+                      " squares connected): S comes close to itself within l_c; lower l_c");
+  return Q;
+}
+
+namespace {
+
+/// What the squares of ∂T know of S: sides of their nodes, distances of their quarters.
+/// Quarter e of a square is the triangle of its corners e, e + 1 and its centre.
+struct Survey {
+  std::vector<signed char> side;  // [mesh nodes], +1 or −1, 0 off ∂T
+  std::vector<char> free;         // [squares], 0: touches another surface or the boundary
+  std::vector<double> excess;     // [squares], tangential excess of the centre beyond the rim, in h
+  std::vector<std::array<double, 4>> beyond;  // [squares], the same of the quarters
+  std::vector<std::array<double, 4>> above;   // [squares], distance from the rim of those above S, in h
+  std::vector<char> sharp;        // [mesh nodes], 1: the node nearest to a sharp corner of S
+};
+
+Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
+  Survey survey;
+  survey.side.assign(M.x.size(), 0);
+  survey.sharp.assign(M.x.size(), 0);
+  for (int n : Q.nodes) survey.side[n] = S.query(M.x[n]).side >= 0 ? 1 : -1;
+  const double perH = 1 / Q.h;
+  for (const Square& s : Q.squares) {
+    bool isFree = true;
+    for (int n : s.node) isFree &= M.dimension[n] == 3;
+    survey.free.push_back(isFree);
+    survey.excess.push_back(perH * S.query(s.centre).excess);
+    std::array<double, 4> beyond{}, above{};
+    for (int e = 0; e < 4; ++e) {
+      const Vec3 middle = (1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre);
+      const SurfaceQuery near = S.query(middle);
+      beyond[e] = perH * near.excess;
+      if (!near.onRim) above[e] = perH * S.rimDistance(near.point);
+    }
+    survey.beyond.push_back(beyond);
+    survey.above.push_back(above);
+  }
+  return survey;
+}
+
+constexpr unsigned char emptySquare = 0, fullSquare = 15;
+
+/// The edge-connected parts of the squares for which in(square), numbered from 1; sizes by number.
+template <class In>
+std::vector<int> connectedParts(const SquareSurface& Q, In in, std::vector<int>& sizes) {
+  std::vector<int> part(Q.squares.size(), 0), queue;
+  sizes.assign(1, 0);
+  for (int first = 0; first < static_cast<int>(part.size()); ++first) {
+    if (part[first] || !in(first)) continue;
+    queue.assign(1, first);
+    part[first] = static_cast<int>(sizes.size());
+    for (std::size_t i = 0; i < queue.size(); ++i)
+      for (int next : Q.squares[queue[i]].across)
+        if (!part[next] && in(next)) part[next] = part[first], queue.push_back(next);
+    sizes.push_back(static_cast<int>(queue.size()));
+  }
+  return part;
+}
+
+int largestPart(const std::vector<int>& sizes) {
+  return static_cast<int>(std::max_element(sizes.begin(), sizes.end()) - sizes.begin());
+}
+
+/// Keeps the largest edge-connected part of the selection and fills its holes.
+void keepLargestPart(const SquareSurface& Q, const Survey& survey, Selection& selected) {
+  std::vector<int> sizes;
+  std::vector<int> part = connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
+  const int kept = largestPart(sizes);
+  for (std::size_t i = 0; i < part.size(); ++i)
+    if (part[i] != kept) selected[i] = emptySquare;
+  part = connectedParts(Q, [&](int i) { return selected[i] == 0; }, sizes);
+  const int outside = largestPart(sizes);
+  for (std::size_t i = 0; i < part.size(); ++i)
+    if (part[i] > 0 && part[i] != outside && survey.free[i]) selected[i] = fullSquare;
+}
+
+/// The number of selected quarters at node n, and of rim edges there.
+struct NodeState { int quarters, rimEdges; };
+NodeState nodeState(const SquareSurface& Q, const Selection& selected, int n) {
+  NodeState state{0, 0};
+  for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
+    const auto [square, corner] = Q.around[i];
+    const Square& s = Q.squares[square];
+    const int next = selected[square] >> corner & 1;
+    const int previous = selected[square] >> ((corner + 3) % 4) & 1;
+    const int beyond = selected[s.across[corner]] >> s.acrossEdge[corner] & 1;
+    state.quarters += next + previous;
+    state.rimEdges += (next != previous) + (next != beyond);
+  }
+  return state;
+}
+
+/// A pinch is a node with more than two rim edges: squares at it that are not in its largest fan go.
+bool cutPinches(const SquareSurface& Q, Selection& selected) {
+  bool any = false;
+  for (int n : Q.nodes) {
+    if (nodeState(Q, selected, n).rimEdges <= 2) continue;
+    int least = -1, leastCount = 5;
+    for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
+      const int square = Q.around[i].first;
+      if (!selected[square]) continue;
+      int neighbours = 0;
+      for (int next : Q.squares[square].across) neighbours += selected[next] != 0;
+      if (neighbours < leastCount) leastCount = neighbours, least = square;
+    }
+    selected[least] = emptySquare;
+    any = true;
+  }
+  return any;
+}
+
+}  // namespace
+
+namespace {
+
+/// [§3.4] The squares with all nodes on one side of S; one disk.
+Selection selectSquares(const SquareSurface& Q, const Survey& survey, int side) {
+  constexpr double maxExcess = .75;  // [choice] of h: squares farther beyond the rim are no candidates
+  constexpr int maxRounds = 100;
+  Selection selected(Q.squares.size(), emptySquare);
+  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
+    bool oneSide = survey.free[i] && survey.excess[i] <= maxExcess;
+    for (int n : Q.squares[i].node) oneSide &= survey.side[n] == side;
+    if (oneSide) selected[i] = fullSquare;
+  }
+  for (int round = 0; round < maxRounds; ++round) {
+    keepLargestPart(Q, survey, selected);
+    if (!cutPinches(Q, selected)) break;
+  }
+  return selected;
+}
+
+/// χ of the selection's closure: 1 for a disk (it is connected by construction).
+int chiOf(const SquareSurface& Q, const Selection& selected) {
+  int vertices = 0, edges = 0, faces = 0;
+  for (int n : Q.nodes) vertices += nodeState(Q, selected, n).quarters > 0;
+  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
+    const Square& s = Q.squares[i];
+    vertices += selected[i] != 0;
+    for (int e = 0; e < 4; ++e) {
+      const int here = selected[i] >> e & 1, previous = selected[i] >> ((e + 3) % 4) & 1;
+      const int there = selected[s.across[e]] >> s.acrossEdge[e] & 1;
+      faces += here;
+      edges += here || previous;                                           // the spoke at corner e
+      edges += here && (!there || static_cast<int>(i) < s.across[e]);  // counted once
+    }
+  }
+  return vertices - edges + faces;
+}
+
+/// 0 where S_M is one disk: else what is wrong, for the message.
+std::string diskFault(const SquareSurface& Q, const Selection& selected) {
+  std::vector<int> sizes;
+  connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
+  if (sizes.size() == 1) return "it is empty";
+  if (sizes.size() > 2) return "it has " + std::to_string(sizes.size() - 1) + " parts";
+  for (int n : Q.nodes)
+    if (nodeState(Q, selected, n).rimEdges > 2) return "it is pinched at node " + std::to_string(n);
+  const int euler = chiOf(Q, selected);
+  return euler == 1 ? "" : "chi = " + std::to_string(euler);
+}
+
+}  // namespace
+
+// ==== 3.5 Surface healing ========================================================================
+
+bool removeThinProtrusions(const SquareSurface& Q, Selection& selected) {
+  bool any = false;
+  for (bool again = true; again;) {
+    again = false;
+    for (std::size_t i = 0; i < Q.squares.size(); ++i) {
+      if (selected[i] != fullSquare) continue;
+      int rimEdges = 0;
+      for (int next : Q.squares[i].across) rimEdges += selected[next] == emptySquare;
+      if (rimEdges >= 3) selected[i] = emptySquare, any = again = true;
+    }
+  }
+  return any;
+}
+
+bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected) {
+  bool any = false;
+  for (int n : Q.nodes) {
+    // triangles of S_M at n: two of a square whose diagonal ends at n, else one
+    int triangles = 0, fill = -1;
+    for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
+      const auto [square, corner] = Q.around[i];
+      const Square& s = Q.squares[square];
+      if (selected[square])
+        triangles += corner % 2 == s.diagonal ? 2 : 1;
+      else if (selected[s.across[corner]] && selected[s.across[(corner + 3) % 4]])
+        fill = square;  // both rim edges at n are sides of this square: it is in their plane
+    }
+    if (triangles < 5 || fill < 0 || nodeState(Q, selected, n).rimEdges != 2) continue;
+    bool isFree = true;
+    for (int corner : Q.squares[fill].node) isFree &= M.dimension[corner] == 3;
+    if (isFree) selected[fill] = fullSquare, any = true;
+  }
+  return any;
+}
+
+
+namespace {
+
+/// [§3.5 departure] Rim regularization: squares, whole or halved along a diagonal, are added and removed
+/// one or two at a time while the rim energy falls:
+///   E = Σ over rim nodes (1/16)(k − t)² + Σ over quarters ¼ (distance/h)²
+/// with k selected quarters at the node (of 45° each), t = 4 or at a sharp corner of S 2; the distance is
+/// the tangential excess of a selected quarter beyond the rim of S, or the distance from the rim of an
+/// unselected one above S.
+class RimRegularization {
+ public:
+  RimRegularization(const SquareSurface& Q, const Survey& survey, int side, Selection& selected)
+      : Q_(Q), survey_(survey), side_(side), selected_(selected) {}
+
+  void run(bool halves) {
+    constexpr int maxSweeps = 60;  // E falls in each: only a guard
+    halves_ = halves;
+    for (int sweep = 0; sweep < maxSweeps; ++sweep) {
+      bool improved = false;
+      for (int i = 0; i < static_cast<int>(Q_.squares.size()); ++i)
+        if (isNearRim(i)) improved |= improve(i);
+      if (!improved) return;
+    }
+  }
+
+  /// E over the whole surface.
+  double energy() const {
+    double E = 0;
+    for (int n : Q_.nodes) E += nodeEnergy(n);
+    for (std::size_t i = 0; i < Q_.squares.size(); ++i) E += squareEnergy(static_cast<int>(i));
+    return E;
+  }
+
+ private:
+  static constexpr unsigned char states_[6] = {0, 15, 3, 6, 12, 9};  // empty, full, four halves
+
+  bool isNearRim(int i) const {
+    const bool here = selected_[i] != 0;
+    if (selected_[i] != emptySquare && selected_[i] != fullSquare) return true;
+    for (int n : Q_.squares[i].node)
+      for (int j = Q_.start[n]; j < Q_.start[n + 1]; ++j)
+        if ((selected_[Q_.around[j].first] != 0) != here) return true;
+    return false;
+  }
+
+  /// Full needs all nodes on the side, a half its three corners.
+  bool isAllowed(int i, unsigned char state) const {
+    if (state == emptySquare) return true;
+    if (!survey_.free[i]) return false;
+    for (int e = 0; e < 4; ++e) {
+      const bool used = (state >> e & 1) || (state >> ((e + 3) % 4) & 1);
+      if (used && survey_.side[Q_.squares[i].node[e]] != side_) return false;
+    }
+    return true;
+  }
+
+  double nodeEnergy(int n) const {
+    constexpr double weight = .25 / 4;
+    const NodeState state = nodeState(Q_, selected_, n);
+    if (state.rimEdges == 0) return 0;
+    const double target = survey_.sharp[n] ? 2 : 4;
+    return weight * (state.quarters - target) * (state.quarters - target);
+  }
+  double squareEnergy(int i) const {
+    double E = 0;
+    for (int e = 0; e < 4; ++e) {
+      const auto& n = Q_.squares[i].node;
+      if (survey_.side[n[e]] != side_ || survey_.side[n[(e + 1) % 4]] != side_) continue;
+      const double distance = selected_[i] >> e & 1 ? survey_.beyond[i][e] : survey_.above[i][e];
+      E += .25 * distance * distance;
+    }
+    return E;
+  }
+
+  int quarterAcross(int i, int e) const {
+    const Square& s = Q_.squares[i];
+    return selected_[s.across[e]] >> s.acrossEdge[e] & 1;
+  }
+
+  /// E and χ of what squares i and j (or i alone, j < 0) touch.
+  struct Local { double E; int chi; };
+  Local local(int i, int j) const {
+    Local sum{0, 0};
+    for (int square : {i, j}) {
+      if (square < 0) continue;
+      const Square& s = Q_.squares[square];
+      sum.E += squareEnergy(square);
+      sum.chi += selected_[square] != 0;  // the centre
+      for (int e = 0; e < 4; ++e) {
+        const int here = selected_[square] >> e & 1, previous = selected_[square] >> ((e + 3) % 4) & 1;
+        sum.chi += here - (here || previous);  // quarter and spoke
+        if (square != j || s.across[e] != i) sum.chi -= here || quarterAcross(square, e);
+        if (square == j && isCorner(i, s.node[e])) continue;
+        sum.E += nodeEnergy(s.node[e]);
+        sum.chi += nodeState(Q_, selected_, s.node[e]).quarters > 0;
+      }
+    }
+    return sum;
+  }
+  bool isCorner(int i, int n) const {
+    const auto& nodes = Q_.squares[i].node;
+    return std::find(nodes.begin(), nodes.end(), n) != nodes.end();
+  }
+
+  /// Rules (a), (c), (d) at square i: two rim edges at a node at most, no tip and no notch of 45°.
+  bool isClean(int i) const {
+    const Square& s = Q_.squares[i];
+    for (int n : s.node) {
+      const NodeState state = nodeState(Q_, selected_, n);
+      if (state.rimEdges > 2 || state.quarters == 1) return false;
+    }
+    if (hasNotch(i)) return false;
+    for (int next : s.across)
+      if (hasNotch(next)) return false;
+    return true;
+  }
+  /// A removed quarter of a half square beside a selected quarter.
+  bool hasNotch(int i) const {
+    if (selected_[i] == emptySquare || selected_[i] == fullSquare) return false;
+    for (int e = 0; e < 4; ++e)
+      if (!(selected_[i] >> e & 1) && quarterAcross(i, e)) return true;
+    return false;
+  }
+
+  /// Tries the states of square i alone, then with each of its neighbours; keeps the best that is better.
+  bool improve(int i) {
+    if (tryStates(i, -1)) return true;
+    bool improved = false;
+    for (int j : Q_.squares[i].across)
+      if (survey_.free[j]) improved |= tryStates(i, j);
+    return improved;
+  }
+
+  bool tryStates(int i, int j) {
+    constexpr double least = 1e-9;  // a fall of E below rounding is none
+    const unsigned char oldI = selected_[i], oldJ = j < 0 ? emptySquare : selected_[j];
+    const Local before = local(i, j);
+    double bestE = before.E - least;
+    unsigned char bestI = oldI, bestJ = oldJ;
+    const int count = halves_ ? 6 : 2;
+    for (int a = 0; a < count; ++a) {
+      if (!isAllowed(i, states_[a])) continue;
+      for (int b = 0; b < (j < 0 ? 1 : count); ++b) {
+        if (j >= 0 && !isAllowed(j, states_[b])) continue;
+        selected_[i] = states_[a];
+        if (j >= 0) selected_[j] = states_[b];
+        const Local now = local(i, j);
+        if (now.E < bestE && now.chi == before.chi && isClean(i) && (j < 0 || isClean(j)))
+          bestE = now.E, bestI = states_[a], bestJ = states_[b];
+      }
+    }
+    selected_[i] = bestI;
+    if (j >= 0) selected_[j] = bestJ;
+    return bestI != oldI || (j >= 0 && bestJ != oldJ);
+  }
+
+  const SquareSurface& Q_;
+  const Survey& survey_;
+  int side_;
+  Selection& selected_;
+  bool halves_ = false;
+};
+
+}  // namespace
+
+namespace {
+
+/// 5000 × the area mean over S of max(0, dist(S, S_M)/h − 1.1)²: S must be near its approximation.
+double uncovered(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                 const Selection& selected) {
+  constexpr double weight = 5000, allowed = 1.1;
+  std::vector<std::array<int, 3>> triangles;
+  for (std::size_t i = 0; i < selected.size(); ++i)
+    if (selected[i]) {
+      const auto& n = Q.squares[i].node;
+      triangles.push_back({n[0], n[1], n[2]});
+      triangles.push_back({n[0], n[2], n[3]});
+    }
+  const TriangleTree tree(M.x, triangles);
+  double sum = 0, area = 0;
+  for (const std::array<int, 3>& t : S.S.triangles) {
+    const Vec3 a = S.S.points[t[0]], b = S.S.points[t[1]], c = S.S.points[t[2]];
+    const double part = .5 * norm(cross(b - a, c - a));
+    const double far = tree.closest((1. / 3) * (a + b + c)).distance / Q.h - allowed;
+    area += part;
+    if (far > 0) sum += part * far * far;
+  }
+  return weight * sum / area;
+}
+
+/// Marks for each sharp corner of S the nearest node of this side.
+void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
+                      Survey& survey) {
+  const RimCorners corners = rimCorners(S);
+  for (int c = 0; c < 4; ++c) {
+    if (!corners.sharp[c]) continue;
+    const Vec3 point = S.S.points[S.rim[corners.at[c]]];
+    int nearest = -1;
+    for (int n : Q.nodes)
+      if (survey.side[n] == side &&
+          (nearest < 0 || norm2(M.x[n] - point) < norm2(M.x[nearest] - point)))
+        nearest = n;
+    if (nearest >= 0) survey.sharp[nearest] = 1;
+  }
+}
+
+}  // namespace
+
+Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
+                             Outline outline) {
+  constexpr int maxRounds = 50;
+  Survey survey = surveySquares(M, Q, S);
+  markSharpCorners(M, Q, S, side, survey);
+  Extraction result;
+  result.selected = selectSquares(Q, survey, side);
+  RimRegularization rim(Q, survey, side, result.selected);
+  if (outline == Outline::paper) {
+    for (int round = 0; round < maxRounds; ++round) {
+      bool changed = removeThinProtrusions(Q, result.selected);
+      changed |= fillHighConnectivityNodes(M, Q, result.selected);
+      if (!changed) break;
+    }
+    keepLargestPart(Q, survey, result.selected);
+  } else {
+    rim.run(false);
+    if (outline == Outline::halfSquares) rim.run(true);
+  }
+  result.fault = diskFault(Q, result.selected);
+  if (result.fault.empty()) result.energy = rim.energy() + uncovered(M, Q, S, result.selected);
+  return result;
+}
+
+namespace {
+
+/// The faces labelled k, and the square and quarter of ∂T where each lies.
+int quarterOf(const Mesh& M, const SquareSurface& Q, int square, std::array<int, 3> face) {
+  const Vec3 middle = (1. / 3) * (M.xi[face[0]] + M.xi[face[1]] + M.xi[face[2]]);
+  const std::array<int, 4>& n = Q.squares[square].node;
+  const Vec3 a = M.xi[n[0]], e1 = M.xi[n[1]] - a, e2 = M.xi[n[3]] - a;
+  const double s = dot(middle - a, e1) / norm2(e1), t = dot(middle - a, e2) / norm2(e2);
+  // the diagonals s = t and s + t = 1 part the square
+  return t < s ? (s + t < 1 ? 0 : 1) : (s + t < 1 ? 3 : 2);
+}
+
+}  // namespace
+
+void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A, const Selection& selected,
+                  int k) {
+  Mesh& M = B.M;
+  const Lattice lattice(Q.level);
+  KeyMap squareAt(Q.keys.size());
+  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
+  std::array<std::int64_t, 3> half;
+  for (int E : elementsOf(A.T))
+    for (int i = 0; i < 4; ++i) {
+      const int other = B.neighbour[E][i];
+      if (other < 0 || A.T[other]) continue;
+      if (!lattice.squareOf(M, faceOpposite(M.tets[E], i), half)) continue;
+      const int square = squareAt.get(Lattice::key(half)) - 1;
+      if (square < 0 || !selected[square]) continue;
+      M.faceLabel[E][i] = k;
+      auto& back = B.neighbour[other];
+      M.faceLabel[other][std::find(back.begin(), back.end(), E) - back.begin()] = k;
+    }
+  // A half whose cut is not the mesh's diagonal: bisect that diagonal, the cut appears.
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    if (selected[i] == emptySquare || selected[i] == fullSquare) continue;
+    const Square& s = Q.squares[i];
+    // halves 3 and 12 (corners 0,1,2 / 2,3,0) are cut from corner 0 to 2, 6 and 9 from 1 to 3
+    const int cut = selected[i] == 3 || selected[i] == 12 ? 0 : 1;
+    if (s.diagonal != cut) B.bisectEdge(s.node[1 - cut], s.node[3 - cut]);
+  }
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      if (M.faceLabel[E][i] != k) continue;
+      const std::array<int, 3> face = faceOpposite(M.tets[E], i);
+      lattice.squareOf(M, face, half);
+      const int square = squareAt.get(Lattice::key(half)) - 1;
+      if (!(selected[square] >> quarterOf(M, Q, square, face) & 1)) M.faceLabel[E][i] = 0;
+    }
+}
+
+namespace {
+
+/// S_M as a complex: its nodes, edges and rim, read off the labelled faces.
+struct SurfaceComplex {
+  std::vector<char> node;                          // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
+  KeyMap edges;                                    // edge → times seen (twice a face): 2 rim, 4 inside
+  std::vector<std::pair<int, int>> edgeList;
+  SurfaceComplex(const Mesh& M, int k) : node(M.x.size(), 0) {
+    for (std::size_t E = 0; E < M.tets.size(); ++E)
+      for (int i = 0; i < 4; ++i) {
+        if (M.faceLabel[E][i] != k) continue;
+        const std::array<int, 3> v = faceOpposite(M.tets[E], i);
+        for (int e = 0; e < 3; ++e) {
+          node[v[e]] = 1;
+          if (edges[edgeKey(v[e], v[(e + 1) % 3])]++ == 0) edgeList.push_back({v[e], v[(e + 1) % 3]});
+        }
+      }
+    for (const auto& [a, b] : edgeList)
+      if (isRimEdge(a, b)) node[a] = node[b] = 2;
+  }
+  bool isEdge(int a, int b) const { return edges.get(edgeKey(a, b)) > 0; }
+  bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 2; }
+};
+
+constexpr int tetEdges[6][2] = {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}};
+
+/// Bisects the edges; true where there were any.
+bool bisectEdges(Bisection& B, const std::vector<std::pair<int, int>>& edges) {
+  for (const auto& [a, b] : edges) B.bisectEdge(a, b);
+  return !edges.empty();
+}
+
+}  // namespace
+
+bool refineTetrahedraWithTwoFaces(Bisection& B, int k) {
+  std::vector<std::pair<int, int>> refine;  // tetrahedron, level
+  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
+    const std::array<int, 4>& label = B.M.faceLabel[E];
+    if (std::count(label.begin(), label.end(), k) > 1)
+      refine.push_back({static_cast<int>(E), B.M.level[E]});
+  }
+  for (const auto& [E, level] : refine)
+    if (B.M.level[E] == level) B.bisect(E);
+  return !refine.empty();
+}
+
+bool refineFacesWithTwoRimEdges(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  std::vector<std::pair<int, int>> refine;
+  for (const std::array<int, 4>& z : B.M.tets)
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 3> v = faceOpposite(z, i);
+      if (SM.node[v[0]] != 2 || SM.node[v[1]] != 2 || SM.node[v[2]] != 2) continue;
+      int rimEdges = 0;
+      for (int e = 0; e < 3; ++e) rimEdges += SM.isRimEdge(v[e], v[(e + 1) % 3]);
+      if (rimEdges > 1) refine.push_back(refinementEdge(B.M, v));
+    }
+  return bisectEdges(B, refine);
+}
+
+bool refineEdgesAcrossTheRim(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  std::vector<std::pair<int, int>> refine;
+  for (const auto& [a, b] : SM.edgeList)
+    if (SM.node[a] == 2 && SM.node[b] == 2 && !SM.isRimEdge(a, b)) refine.push_back({a, b});
+  return bisectEdges(B, refine);
+}
+
+bool refineEdgesBetweenSurfaces(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  const std::size_t before = B.M.tets.size();
+  std::vector<std::pair<int, int>> refine;
+  for (const std::array<int, 4>& z : B.M.tets)
+    for (const auto& e : tetEdges) {
+      const int a = z[e[0]], b = z[e[1]];
+      if ((SM.node[a] && B.M.dimension[b] < 3 && !SM.node[b]) ||
+          (SM.node[b] && B.M.dimension[a] < 3 && !SM.node[a]))
+        refine.push_back({a, b});
+    }
+  bisectEdges(B, refine);
+  return B.M.tets.size() > before;
+}
+
+bool refineToFullSubcomplex(Bisection& B, int k) {
+  const SurfaceComplex SM(B.M, k);
+  std::vector<std::pair<int, int>> refine;
+  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
+    const std::array<int, 4>& z = B.M.tets[E];
+    for (const auto& e : tetEdges)
+      if (SM.node[z[e[0]]] && SM.node[z[e[1]]] && !SM.isEdge(z[e[0]], z[e[1]]))
+        refine.push_back({z[e[0]], z[e[1]]});
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 3> v = faceOpposite(z, i);
+      if (B.M.faceLabel[E][i] != k && SM.isEdge(v[0], v[1]) && SM.isEdge(v[1], v[2]) &&
+          SM.isEdge(v[2], v[0]))
+        refine.push_back(refinementEdge(B.M, v));
+    }
+  }
+  return bisectEdges(B, refine);
+}
+
+int surfaceHealing(Bisection& B, int k) {
+  constexpr int maxRounds = 30;  // [choice] rounds end after 2 to 5 where they end
+  for (int round = 1; round <= maxRounds; ++round) {
+    bool changed = refineTetrahedraWithTwoFaces(B, k);
+    changed |= refineFacesWithTwoRimEdges(B, k);
+    changed |= refineEdgesAcrossTheRim(B, k);
+    changed |= refineEdgesBetweenSurfaces(B, k);
+    changed |= refineToFullSubcomplex(B, k);
+    if (!changed) return round;
+  }
+  throw MethodError("insertSurface (§3.5): the rules of surface healing do not settle after " +
+                    std::to_string(maxRounds) + " rounds; lower l_c");
+}
+
+// ==== Tools for 3.6: sparse iterative solver ====================================================
 
 namespace {
 
@@ -2487,1019 +3498,6 @@ ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool
 }
 
 
-// ==== Tools for 3.2: triangle–tetrahedron intersection ===========================================
-
-bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle) {
-  constexpr double tolerance = 1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
-  constexpr int faces[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
-  Vec3 polygon[8], clipped[8];  // three corners and at most one more for each plane
-  int corners = 3;
-  for (int i = 0; i < 3; ++i) polygon[i] = triangle[i];
-  for (int i = 0; i < 4; ++i) {
-    const Vec3 a = tet[faces[i][0]], b = tet[faces[i][1]], c = tet[faces[i][2]];
-    Vec3 inward = cross(b - a, c - a);
-    const double height = dot(inward, tet[i] - a);
-    inward = (1 / height) * inward;  // 0 on the face, 1 at the opposite vertex
-    int kept = 0;
-    for (int j = 0; j < corners; ++j) {
-      const Vec3 p = polygon[j], q = polygon[(j + 1) % corners];
-      const double dp = dot(inward, p - a) + tolerance, dq = dot(inward, q - a) + tolerance;
-      if (dp >= 0) clipped[kept++] = p;
-      if ((dp > 0 && dq < 0) || (dp < 0 && dq > 0)) clipped[kept++] = p + dp / (dp - dq) * (q - p);
-    }
-    if (kept == 0) return false;
-    corners = kept;
-    std::copy(clipped, clipped + kept, polygon);
-  }
-  return true;
-}
-
-// ==== 3.2 Volumetric approximation ===============================================================
-
-double longestEdge(const Mesh& M, int E) {
-  double longest = 0;
-  for (int i = 0; i < 4; ++i)
-    for (int j = 0; j < i; ++j) {
-      const Vec3 d = M.xi[M.tets[E][i]] - M.xi[M.tets[E][j]];
-      longest = std::max(longest, norm(Vec3{d.x * M.cube.x, d.y * M.cube.y, d.z * M.cube.z}));
-    }
-  return longest;
-}
-
-bool isTooLarge(const Mesh& M, int E, double lc) { return longestEdge(M, E) >= lc; }
-
-namespace {
-
-/// Whether S meets tetrahedron E: candidates by the tree, then by clipping.
-bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
-  std::array<Vec3, 4> tet;
-  for (int i = 0; i < 4; ++i) tet[i] = M.x[M.tets[E][i]];
-  Vec3 lo = tet[0], hi = tet[0];
-  for (const Vec3& p : tet) {
-    lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
-    hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
-  }
-  const Vec3 margin = 1e-9 * (hi - lo);
-  bool hit = false;
-  S.tree.visit(lo - margin, hi + margin, [&](int t) {
-    const std::array<int, 3>& v = S.S.triangles[t];
-    return hit = intersects(tet, {S.S.points[v[0]], S.S.points[v[1]], S.S.points[v[2]]});
-  });
-  return hit;
-}
-
-enum class Cut : char { unknown, yes, no };
-
-/// Tells of each tetrahedron not yet known whether S cuts it.
-void classify(const Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut) {
-  cut.resize(B.M.tets.size(), Cut::unknown);
-  for (std::size_t E = 0; E < cut.size(); ++E)
-    if (cut[E] == Cut::unknown)
-      cut[E] = meetsSurface(B.M, static_cast<int>(E), S) ? Cut::yes : Cut::no;
-}
-
-/// Refines the tetrahedra cut by S that `wanted` asks for until there is none.
-template <class Wanted>
-void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wanted wanted) {
-  constexpr int maxPasses = 250;  // one level a pass; levels fit in a byte
-  for (int pass = 0; pass < maxPasses; ++pass) {
-    classify(B, S, cut);
-    std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
-    for (std::size_t E = 0; E < cut.size(); ++E)
-      if (cut[E] == Cut::yes && wanted(static_cast<int>(E)))
-        refine.push_back({static_cast<int>(E), B.M.level[E]});
-    if (refine.empty()) return;
-    B.splits.clear();
-    for (const auto& [E, level] : refine)
-      if (B.M.level[E] == level) B.bisect(E);
-    cut.resize(B.M.tets.size(), Cut::unknown);
-    for (const auto& [parent, child] : B.splits) cut[parent] = cut[child] = Cut::unknown;
-  }
-}
-
-}  // namespace
-
-Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc) {
-  std::vector<Cut> cut;
-  refineCut(B, S, cut, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
-  // The level of whole cubes that §3.3 completes T to; T reaches it already here.
-  Approximation A;
-  for (std::size_t E = 0; E < cut.size(); ++E)
-    if (cut[E] == Cut::yes) A.level = std::max(A.level, (B.M.level[E] + 2) / 3 * 3);
-  refineCut(B, S, cut, [&](int E) { return B.M.level[E] < A.level; });
-  A.T.resize(cut.size());
-  for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E] == Cut::yes;
-  return A;
-}
-
-// ==== Tools for 3.3: the lattice of cubes ========================================================
-
-namespace {
-
-/// The cubes of one level in the computational space. Keys are positions in half cubes: odd, odd, odd
-/// is a cube's centre; even, odd, odd a square's; even, even, even a node.
-struct Lattice {
-  double scale;  // cubes per unit of ξ
-  explicit Lattice(int level) : scale(std::ldexp(1., level / 3)) {}
-  static std::uint64_t key(std::array<std::int64_t, 3> half) {
-    return std::uint64_t(half[0]) << 42 | std::uint64_t(half[1]) << 21 | std::uint64_t(half[2]);
-  }
-  static std::array<std::int64_t, 3> position(std::uint64_t key) {
-    constexpr std::uint64_t mask = (1u << 21) - 1;
-    return {std::int64_t(key >> 42), std::int64_t(key >> 21 & mask), std::int64_t(key & mask)};
-  }
-  std::int64_t inside(double c) const { return 2 * std::int64_t(std::floor(c * scale)) + 1; }
-  bool onPlane(double c) const { return c * scale == std::floor(c * scale); }
-  std::uint64_t cubeOf(const Mesh& M, int E) const {
-    const std::array<int, 4>& z = M.tets[E];
-    const Vec3 c = .25 * (M.xi[z[0]] + M.xi[z[1]] + M.xi[z[2]] + M.xi[z[3]]);
-    return key({inside(c.x), inside(c.y), inside(c.z)});
-  }
-  bool isNode(Vec3 xi) const { return onPlane(xi.x) && onPlane(xi.y) && onPlane(xi.z); }
-  std::uint64_t node(Vec3 xi) const {
-    return key({std::int64_t(2 * xi.x * scale), std::int64_t(2 * xi.y * scale),
-                std::int64_t(2 * xi.z * scale)});
-  }
-  /// The square that holds the face; false where the face is inside a cube.
-  bool squareOf(const Mesh& M, std::array<int, 3> face, std::array<std::int64_t, 3>& half) const {
-    const Vec3 a = M.xi[face[0]], b = M.xi[face[1]], c = M.xi[face[2]];
-    const Vec3 middle = (1. / 3) * (a + b + c);
-    half = {inside(middle.x), inside(middle.y), inside(middle.z)};
-    if (a.x == b.x && a.x == c.x && onPlane(a.x)) return half[0] = std::int64_t(2 * a.x * scale), true;
-    if (a.y == b.y && a.y == c.y && onPlane(a.y)) return half[1] = std::int64_t(2 * a.y * scale), true;
-    if (a.z == b.z && a.z == c.z && onPlane(a.z)) return half[2] = std::int64_t(2 * a.z * scale), true;
-    return false;
-  }
-};
-
-std::array<int, 3> faceOpposite(const std::array<int, 4>& z, int i) {
-  return {z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
-}
-
-}  // namespace
-
-// ==== 3.3 Volumetric approximation healing =======================================================
-
-int chi(int nE, int nF, int nC) { return nE - nF + nC; }
-
-int chi(unsigned cubes) {
-  int nE = 0, nF = 0, nC = 0;
-  for (int c = 0; c < 8; ++c) nC += cubes >> c & 1;
-  // edges: the half axes; faces: the quarter planes; each belongs to T with any cube that has it
-  for (int axis = 0; axis < 3; ++axis)
-    for (int side = 0; side < 2; ++side) {
-      bool edge = false;
-      for (int c = 0; c < 8; ++c) edge |= (c >> axis & 1) == side && (cubes >> c & 1);
-      nE += edge;
-      for (int other = 0; other < 2; ++other) {
-        const int axis2 = (axis + 1) % 3;
-        bool face = false;
-        for (int c = 0; c < 8; ++c)
-          face |= (c >> axis & 1) == side && (c >> axis2 & 1) == other && (cubes >> c & 1);
-        nF += face;
-      }
-    }
-  return chi(nE, nF, nC);
-}
-
-bool isFaceConnected(unsigned cubes) {
-  unsigned reached = cubes & -cubes;
-  for (int round = 0; round < 8; ++round)
-    for (int c = 0; c < 8; ++c)
-      for (int axis = 0; axis < 3; ++axis)
-        if ((reached >> c & 1) && (cubes >> (c ^ 1 << axis) & 1)) reached |= 1u << (c ^ 1 << axis);
-  return reached == cubes;
-}
-
-bool isLocalDisk(unsigned cubes) {
-  return cubes == 255 || cubes == 0 ||
-         (chi(cubes) == 1 && isFaceConnected(cubes) && isFaceConnected(255u & ~cubes));
-}
-
-namespace {
-
-/// Adds to T whatever shares a cube with an element of it: a boundary face of T that is not on the
-/// lattice's planes has its neighbour refined to the same level and added.
-void completeCubes(Bisection& B, Approximation& A, std::vector<int> queue) {
-  const Lattice lattice(A.level);
-  std::array<std::int64_t, 3> square;
-  for (std::size_t at = 0; at < queue.size(); ++at)
-    for (int i = 0; i < 4; ++i) {
-      const int E = queue[at];
-      if (lattice.squareOf(B.M, faceOpposite(B.M.tets[E], i), square)) continue;
-      while (B.M.level[B.neighbour[E][i]] < A.level) B.bisect(B.neighbour[E][i]);
-      A.T.resize(B.M.tets.size(), 0);
-      const int next = B.neighbour[E][i];
-      if (A.T[next]) continue;
-      A.T[next] = 1;
-      queue.push_back(next);
-    }
-}
-
-std::vector<int> elementsOf(const std::vector<char>& T) {
-  std::vector<int> elements;
-  for (std::size_t E = 0; E < T.size(); ++E)
-    if (T[E]) elements.push_back(static_cast<int>(E));
-  return elements;
-}
-
-/// For each lattice node of T the cubes of T around it: bit 1 x+, bit 2 y+, bit 4 z+ of the cube's place.
-KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint64_t>& nodes) {
-  const Lattice lattice(A.level);
-  KeyMap cubes, at;
-  for (int E : elementsOf(A.T)) {
-    const std::uint64_t key = lattice.cubeOf(M, E);
-    if (cubes[key]++) continue;
-    const std::array<std::int64_t, 3> p = Lattice::position(key);
-    for (int c = 0; c < 8; ++c) {
-      // seen from its corner at side c the cube lies on the other side
-      const std::uint64_t node = Lattice::key(
-          {p[0] + (c & 1 ? 1 : -1), p[1] + (c & 2 ? 1 : -1), p[2] + (c & 4 ? 1 : -1)});
-      int& mask = at[node];
-      if (mask == 0) nodes.push_back(node);
-      mask |= 1 << (7 - c);
-    }
-  }
-  return at;
-}
-
-/// The elements adjacent to the node, refined to T's level, join T.
-void addElementsAt(Bisection& B, Approximation& A, int node) {
-  std::vector<int> around, added;
-  for (bool coarse = true; coarse;) {
-    coarse = false;
-    B.star(node, around);
-    for (int E : around)
-      if (B.M.level[E] < A.level) {
-        B.bisect(E);
-        coarse = true;
-        break;
-      }
-  }
-  A.T.resize(B.M.tets.size(), 0);
-  for (int E : around)
-    if (!A.T[E]) {
-      A.T[E] = 1;
-      added.push_back(E);
-    }
-  completeCubes(B, A, added);
-}
-
-}  // namespace
-
-void volumetricHealing(Bisection& B, Approximation& A) {
-  constexpr int maxRounds = 200;
-  completeCubes(B, A, elementsOf(A.T));
-  const Lattice lattice(A.level);
-  for (int round = 0; round < maxRounds; ++round) {
-    std::vector<std::uint64_t> keys;
-    const KeyMap cubes = cubesAtNodes(B.M, A, keys);
-    KeyMap meshNode(keys.size());
-    for (int E : elementsOf(A.T))
-      for (int n : B.M.tets[E])
-        if (lattice.isNode(B.M.xi[n])) meshNode[lattice.node(B.M.xi[n])] = n;
-    std::vector<int> bad;
-    for (std::uint64_t key : keys)
-      if (!isLocalDisk(cubes.get(key))) bad.push_back(meshNode.get(key));
-    if (bad.empty()) return;
-    for (int n : bad) {
-      if (B.M.dimension[n] < 3)
-        throw MethodError("insertSurface (§3.3): T reaches the boundary or another surface at node " +
-                          std::to_string(n) + "; lower l_c");
-      addElementsAt(B, A, n);
-    }
-  }
-  throw MethodError("insertSurface (§3.3): T has no boundary that is a surface after " +
-                    std::to_string(maxRounds) + " rounds; lower l_c");
-}
-
-// ==== 3.4 Surface extraction =====================================================================
-
-namespace {
-
-/// The longest edge of a face in the computational space: the one that bisection splits first.
-std::pair<int, int> refinementEdge(const Mesh& M, std::array<int, 3> face) {
-  std::pair<int, int> longest{face[0], face[1]};
-  double length = 0;
-  for (int e = 0; e < 3; ++e) {
-    const double l = norm2(M.xi[face[(e + 1) % 3]] - M.xi[face[e]]);
-    if (l > length) length = l, longest = {face[e], face[(e + 1) % 3]};
-  }
-  return longest;
-}
-
-/// The squares of ∂T: faces of cubes in T whose other cube is not, counter-clockwise from outside.
-void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, SquareSurface& Q) {
-  const Lattice lattice(A.level);
-  KeyMap inside;
-  std::vector<std::uint64_t> cubes;
-  for (int E : elementsOf(A.T)) {
-    const std::uint64_t key = lattice.cubeOf(M, E);
-    if (!inside[key]++) cubes.push_back(key);
-  }
-  for (std::uint64_t key : cubes) {
-    const std::array<std::int64_t, 3> cube = Lattice::position(key);
-    for (int axis = 0; axis < 3; ++axis)
-      for (int side = -1; side <= 1; side += 2) {
-        std::array<std::int64_t, 3> beyond = cube, centre = cube;
-        beyond[axis] += 2 * side;
-        centre[axis] += side;
-        if (inside.get(Lattice::key(beyond))) continue;
-        const int a1 = (axis + (side > 0 ? 1 : 2)) % 3, a2 = (axis + (side > 0 ? 2 : 1)) % 3;
-        constexpr int around[4][2] = {{-1, -1}, {1, -1}, {1, 1}, {-1, 1}};
-        Square s;
-        for (int e = 0; e < 4; ++e) {
-          std::array<std::int64_t, 3> corner = centre;
-          corner[a1] += around[e][0];
-          corner[a2] += around[e][1];
-          s.node[e] = meshNode.get(Lattice::key(corner)) - 1;
-        }
-        s.centre = .25 * (M.x[s.node[0]] + M.x[s.node[1]] + M.x[s.node[2]] + M.x[s.node[3]]);
-        Q.squares.push_back(s);
-        Q.keys.push_back(Lattice::key(centre));
-      }
-  }
-}
-
-/// Joins the squares along their edges; each edge of ∂T has two.
-void joinSquares(SquareSurface& Q) {
-  KeyMap first(2 * Q.squares.size());  // edge → 1 + 4 square + side of the first square that has it
-  for (std::size_t i = 0; i < Q.squares.size(); ++i)
-    for (int e = 0; e < 4; ++e) {
-      Square& s = Q.squares[i];
-      int& other = first[edgeKey(s.node[e], s.node[(e + 1) % 4])];
-      if (other == 0) {
-        other = 1 + 4 * static_cast<int>(i) + e;
-        continue;
-      }
-      const int j = (other - 1) / 4, g = (other - 1) % 4;
-      s.across[e] = j, s.acrossEdge[e] = g;
-      Q.squares[j].across[g] = static_cast<int>(i), Q.squares[j].acrossEdge[g] = e;
-    }
-}
-
-/// Which diagonal of each square is an edge of the mesh: the longest edge of its faces. (Bisection reflects
-/// the cubes: it is not Kuhn's lowest to highest corner.)
-void findDiagonals(const Mesh& M, const Approximation& A, SquareSurface& Q) {
-  const Lattice lattice(A.level);
-  KeyMap squareAt(Q.keys.size());
-  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
-  std::array<std::int64_t, 3> half;
-  for (int E : elementsOf(A.T))
-    for (int i = 0; i < 4; ++i) {
-      const std::array<int, 3> face = faceOpposite(M.tets[E], i);
-      if (!lattice.squareOf(M, face, half)) continue;
-      const int square = squareAt.get(Lattice::key(half)) - 1;
-      if (square < 0) continue;
-      Square& s = Q.squares[square];
-      const std::pair<int, int> edge = refinementEdge(M, face);
-      for (int d = 0; d < 2; ++d)
-        if (edgeKey(edge.first, edge.second) == edgeKey(s.node[d], s.node[d + 2])) s.diagonal = d;
-    }
-}
-
-/// Squares around each node: (square, corner) in compressed rows over the nodes of ∂T.
-void collectNodes(SquareSurface& Q, int meshNodes) {
-  Q.start.assign(meshNodes + 1, 0);
-  for (const Square& s : Q.squares)
-    for (int n : s.node) ++Q.start[n + 1];
-  for (int n = 0; n < meshNodes; ++n)
-    if (Q.start[n + 1] > 0) Q.nodes.push_back(n);
-  std::partial_sum(Q.start.begin(), Q.start.end(), Q.start.begin());
-  Q.around.resize(Q.start.back());
-  std::vector<int> next(Q.start.begin(), Q.start.end() - 1);
-  for (std::size_t i = 0; i < Q.squares.size(); ++i)
-    for (int e = 0; e < 4; ++e)
-      Q.around[next[Q.squares[i].node[e]]++] = {static_cast<int>(i), e};
-}
-
-}  // namespace
-
-SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
-  const Lattice lattice(A.level);
-  SquareSurface Q;
-  Q.level = A.level;
-  Q.h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) / lattice.scale;
-  KeyMap meshNode;
-  for (int E : elementsOf(A.T))
-    for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
-  addSquares(M, A, meshNode, Q);
-  joinSquares(Q);
-  findDiagonals(M, A, Q);
-  collectNodes(Q, static_cast<int>(M.x.size()));
-
-  // ∂T must be one sphere: V − E + F = 2 with E = 2 F, and connected.
-  const int euler = static_cast<int>(Q.nodes.size()) - static_cast<int>(Q.squares.size());
-  std::vector<int> part(1, 0);
-  std::vector<char> seen(Q.squares.size(), 0);
-  if (!seen.empty()) seen[0] = 1;
-  for (std::size_t i = 0; i < part.size() && !seen.empty(); ++i)
-    for (int next : Q.squares[part[i]].across)
-      if (!seen[next]) seen[next] = 1, part.push_back(next);
-  if (euler != 2 || part.size() != Q.squares.size())
-    throw MethodError("insertSurface (§3.3): the boundary of T is no sphere (chi = " +
-                      std::to_string(euler) + ", " + std::to_string(part.size()) + " of " +
-                      std::to_string(Q.squares.size()) +
-                      " squares connected): S comes close to itself within l_c; lower l_c");
-  return Q;
-}
-
-namespace {
-
-/// What the squares of ∂T know of S: sides of their nodes, distances of their quarters.
-/// Quarter e of a square is the triangle of its corners e, e + 1 and its centre.
-struct Survey {
-  std::vector<signed char> side;  // [mesh nodes], +1 or −1, 0 off ∂T
-  std::vector<char> free;         // [squares], 0: touches another surface or the boundary
-  std::vector<double> excess;     // [squares], tangential excess of the centre beyond the rim, in h
-  std::vector<std::array<double, 4>> beyond;  // [squares], the same of the quarters
-  std::vector<std::array<double, 4>> above;   // [squares], distance from the rim of those above S, in h
-  std::vector<char> sharp;        // [mesh nodes], 1: the node nearest to a sharp corner of S
-};
-
-Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
-  Survey survey;
-  survey.side.assign(M.x.size(), 0);
-  survey.sharp.assign(M.x.size(), 0);
-  for (int n : Q.nodes) survey.side[n] = S.query(M.x[n]).side >= 0 ? 1 : -1;
-  const double perH = 1 / Q.h;
-  for (const Square& s : Q.squares) {
-    bool isFree = true;
-    for (int n : s.node) isFree &= M.dimension[n] == 3;
-    survey.free.push_back(isFree);
-    survey.excess.push_back(perH * S.query(s.centre).excess);
-    std::array<double, 4> beyond{}, above{};
-    for (int e = 0; e < 4; ++e) {
-      const Vec3 middle = (1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre);
-      const SurfaceQuery near = S.query(middle);
-      beyond[e] = perH * near.excess;
-      if (!near.onRim) above[e] = perH * S.rimDistance(near.point);
-    }
-    survey.beyond.push_back(beyond);
-    survey.above.push_back(above);
-  }
-  return survey;
-}
-
-constexpr unsigned char emptySquare = 0, fullSquare = 15;
-
-/// The edge-connected parts of the squares for which in(square), numbered from 1; sizes by number.
-template <class In>
-std::vector<int> connectedParts(const SquareSurface& Q, In in, std::vector<int>& sizes) {
-  std::vector<int> part(Q.squares.size(), 0), queue;
-  sizes.assign(1, 0);
-  for (int first = 0; first < static_cast<int>(part.size()); ++first) {
-    if (part[first] || !in(first)) continue;
-    queue.assign(1, first);
-    part[first] = static_cast<int>(sizes.size());
-    for (std::size_t i = 0; i < queue.size(); ++i)
-      for (int next : Q.squares[queue[i]].across)
-        if (!part[next] && in(next)) part[next] = part[first], queue.push_back(next);
-    sizes.push_back(static_cast<int>(queue.size()));
-  }
-  return part;
-}
-
-int largestPart(const std::vector<int>& sizes) {
-  return static_cast<int>(std::max_element(sizes.begin(), sizes.end()) - sizes.begin());
-}
-
-/// Keeps the largest edge-connected part of the selection and fills its holes.
-void keepLargestPart(const SquareSurface& Q, const Survey& survey, Selection& selected) {
-  std::vector<int> sizes;
-  std::vector<int> part = connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
-  const int kept = largestPart(sizes);
-  for (std::size_t i = 0; i < part.size(); ++i)
-    if (part[i] != kept) selected[i] = emptySquare;
-  part = connectedParts(Q, [&](int i) { return selected[i] == 0; }, sizes);
-  const int outside = largestPart(sizes);
-  for (std::size_t i = 0; i < part.size(); ++i)
-    if (part[i] > 0 && part[i] != outside && survey.free[i]) selected[i] = fullSquare;
-}
-
-/// The number of selected quarters at node n, and of rim edges there.
-struct NodeState { int quarters, rimEdges; };
-NodeState nodeState(const SquareSurface& Q, const Selection& selected, int n) {
-  NodeState state{0, 0};
-  for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
-    const auto [square, corner] = Q.around[i];
-    const Square& s = Q.squares[square];
-    const int next = selected[square] >> corner & 1;
-    const int previous = selected[square] >> ((corner + 3) % 4) & 1;
-    const int beyond = selected[s.across[corner]] >> s.acrossEdge[corner] & 1;
-    state.quarters += next + previous;
-    state.rimEdges += (next != previous) + (next != beyond);
-  }
-  return state;
-}
-
-/// A pinch is a node with more than two rim edges: squares at it that are not in its largest fan go.
-bool cutPinches(const SquareSurface& Q, Selection& selected) {
-  bool any = false;
-  for (int n : Q.nodes) {
-    if (nodeState(Q, selected, n).rimEdges <= 2) continue;
-    int least = -1, leastCount = 5;
-    for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
-      const int square = Q.around[i].first;
-      if (!selected[square]) continue;
-      int neighbours = 0;
-      for (int next : Q.squares[square].across) neighbours += selected[next] != 0;
-      if (neighbours < leastCount) leastCount = neighbours, least = square;
-    }
-    selected[least] = emptySquare;
-    any = true;
-  }
-  return any;
-}
-
-}  // namespace
-
-namespace {
-
-/// [§3.4] The squares with all nodes on one side of S; one disk.
-Selection selectSquares(const SquareSurface& Q, const Survey& survey, int side) {
-  constexpr double maxExcess = .75;  // [choice] of h: squares farther beyond the rim are no candidates
-  constexpr int maxRounds = 100;
-  Selection selected(Q.squares.size(), emptySquare);
-  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
-    bool oneSide = survey.free[i] && survey.excess[i] <= maxExcess;
-    for (int n : Q.squares[i].node) oneSide &= survey.side[n] == side;
-    if (oneSide) selected[i] = fullSquare;
-  }
-  for (int round = 0; round < maxRounds; ++round) {
-    keepLargestPart(Q, survey, selected);
-    if (!cutPinches(Q, selected)) break;
-  }
-  return selected;
-}
-
-/// χ of the selection's closure: 1 for a disk (it is connected by construction).
-int chiOf(const SquareSurface& Q, const Selection& selected) {
-  int vertices = 0, edges = 0, faces = 0;
-  for (int n : Q.nodes) vertices += nodeState(Q, selected, n).quarters > 0;
-  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
-    const Square& s = Q.squares[i];
-    vertices += selected[i] != 0;
-    for (int e = 0; e < 4; ++e) {
-      const int here = selected[i] >> e & 1, previous = selected[i] >> ((e + 3) % 4) & 1;
-      const int there = selected[s.across[e]] >> s.acrossEdge[e] & 1;
-      faces += here;
-      edges += here || previous;                                           // the spoke at corner e
-      edges += here && (!there || static_cast<int>(i) < s.across[e]);  // counted once
-    }
-  }
-  return vertices - edges + faces;
-}
-
-/// 0 where S_M is one disk: else what is wrong, for the message.
-std::string diskFault(const SquareSurface& Q, const Selection& selected) {
-  std::vector<int> sizes;
-  connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
-  if (sizes.size() == 1) return "it is empty";
-  if (sizes.size() > 2) return "it has " + std::to_string(sizes.size() - 1) + " parts";
-  for (int n : Q.nodes)
-    if (nodeState(Q, selected, n).rimEdges > 2) return "it is pinched at node " + std::to_string(n);
-  const int euler = chiOf(Q, selected);
-  return euler == 1 ? "" : "chi = " + std::to_string(euler);
-}
-
-}  // namespace
-
-// ==== 3.5 Surface healing ========================================================================
-
-bool removeThinProtrusions(const SquareSurface& Q, Selection& selected) {
-  bool any = false;
-  for (bool again = true; again;) {
-    again = false;
-    for (std::size_t i = 0; i < Q.squares.size(); ++i) {
-      if (selected[i] != fullSquare) continue;
-      int rimEdges = 0;
-      for (int next : Q.squares[i].across) rimEdges += selected[next] == emptySquare;
-      if (rimEdges >= 3) selected[i] = emptySquare, any = again = true;
-    }
-  }
-  return any;
-}
-
-bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected) {
-  bool any = false;
-  for (int n : Q.nodes) {
-    // triangles of S_M at n: two of a square whose diagonal ends at n, else one
-    int triangles = 0, fill = -1;
-    for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
-      const auto [square, corner] = Q.around[i];
-      const Square& s = Q.squares[square];
-      if (selected[square])
-        triangles += corner % 2 == s.diagonal ? 2 : 1;
-      else if (selected[s.across[corner]] && selected[s.across[(corner + 3) % 4]])
-        fill = square;  // both rim edges at n are sides of this square: it is in their plane
-    }
-    if (triangles < 5 || fill < 0 || nodeState(Q, selected, n).rimEdges != 2) continue;
-    bool isFree = true;
-    for (int corner : Q.squares[fill].node) isFree &= M.dimension[corner] == 3;
-    if (isFree) selected[fill] = fullSquare, any = true;
-  }
-  return any;
-}
-
-
-namespace {
-
-/// [§3.5 departure] Rim regularization: squares, whole or halved along a diagonal, are added and removed
-/// one or two at a time while the rim energy falls:
-///   E = Σ over rim nodes (1/16)(k − t)² + Σ over quarters ¼ (distance/h)²
-/// with k selected quarters at the node (of 45° each), t = 4 or at a sharp corner of S 2; the distance is
-/// the tangential excess of a selected quarter beyond the rim of S, or the distance from the rim of an
-/// unselected one above S.
-class RimRegularization {
- public:
-  RimRegularization(const SquareSurface& Q, const Survey& survey, int side, Selection& selected)
-      : Q_(Q), survey_(survey), side_(side), selected_(selected) {}
-
-  void run(bool halves) {
-    constexpr int maxSweeps = 60;  // E falls in each: only a guard
-    halves_ = halves;
-    for (int sweep = 0; sweep < maxSweeps; ++sweep) {
-      bool improved = false;
-      for (int i = 0; i < static_cast<int>(Q_.squares.size()); ++i)
-        if (isNearRim(i)) improved |= improve(i);
-      if (!improved) return;
-    }
-  }
-
-  /// E over the whole surface.
-  double energy() const {
-    double E = 0;
-    for (int n : Q_.nodes) E += nodeEnergy(n);
-    for (std::size_t i = 0; i < Q_.squares.size(); ++i) E += squareEnergy(static_cast<int>(i));
-    return E;
-  }
-
- private:
-  static constexpr unsigned char states_[6] = {0, 15, 3, 6, 12, 9};  // empty, full, four halves
-
-  bool isNearRim(int i) const {
-    const bool here = selected_[i] != 0;
-    if (selected_[i] != emptySquare && selected_[i] != fullSquare) return true;
-    for (int n : Q_.squares[i].node)
-      for (int j = Q_.start[n]; j < Q_.start[n + 1]; ++j)
-        if ((selected_[Q_.around[j].first] != 0) != here) return true;
-    return false;
-  }
-
-  /// Full needs all nodes on the side, a half its three corners.
-  bool isAllowed(int i, unsigned char state) const {
-    if (state == emptySquare) return true;
-    if (!survey_.free[i]) return false;
-    for (int e = 0; e < 4; ++e) {
-      const bool used = (state >> e & 1) || (state >> ((e + 3) % 4) & 1);
-      if (used && survey_.side[Q_.squares[i].node[e]] != side_) return false;
-    }
-    return true;
-  }
-
-  double nodeEnergy(int n) const {
-    constexpr double weight = .25 / 4;
-    const NodeState state = nodeState(Q_, selected_, n);
-    if (state.rimEdges == 0) return 0;
-    const double target = survey_.sharp[n] ? 2 : 4;
-    return weight * (state.quarters - target) * (state.quarters - target);
-  }
-  double squareEnergy(int i) const {
-    double E = 0;
-    for (int e = 0; e < 4; ++e) {
-      const auto& n = Q_.squares[i].node;
-      if (survey_.side[n[e]] != side_ || survey_.side[n[(e + 1) % 4]] != side_) continue;
-      const double distance = selected_[i] >> e & 1 ? survey_.beyond[i][e] : survey_.above[i][e];
-      E += .25 * distance * distance;
-    }
-    return E;
-  }
-
-  int quarterAcross(int i, int e) const {
-    const Square& s = Q_.squares[i];
-    return selected_[s.across[e]] >> s.acrossEdge[e] & 1;
-  }
-
-  /// E and χ of what squares i and j (or i alone, j < 0) touch.
-  struct Local { double E; int chi; };
-  Local local(int i, int j) const {
-    Local sum{0, 0};
-    for (int square : {i, j}) {
-      if (square < 0) continue;
-      const Square& s = Q_.squares[square];
-      sum.E += squareEnergy(square);
-      sum.chi += selected_[square] != 0;  // the centre
-      for (int e = 0; e < 4; ++e) {
-        const int here = selected_[square] >> e & 1, previous = selected_[square] >> ((e + 3) % 4) & 1;
-        sum.chi += here - (here || previous);  // quarter and spoke
-        if (square != j || s.across[e] != i) sum.chi -= here || quarterAcross(square, e);
-        if (square == j && isCorner(i, s.node[e])) continue;
-        sum.E += nodeEnergy(s.node[e]);
-        sum.chi += nodeState(Q_, selected_, s.node[e]).quarters > 0;
-      }
-    }
-    return sum;
-  }
-  bool isCorner(int i, int n) const {
-    const auto& nodes = Q_.squares[i].node;
-    return std::find(nodes.begin(), nodes.end(), n) != nodes.end();
-  }
-
-  /// Rules (a), (c), (d) at square i: two rim edges at a node at most, no tip and no notch of 45°.
-  bool isClean(int i) const {
-    const Square& s = Q_.squares[i];
-    for (int n : s.node) {
-      const NodeState state = nodeState(Q_, selected_, n);
-      if (state.rimEdges > 2 || state.quarters == 1) return false;
-    }
-    if (hasNotch(i)) return false;
-    for (int next : s.across)
-      if (hasNotch(next)) return false;
-    return true;
-  }
-  /// A removed quarter of a half square beside a selected quarter.
-  bool hasNotch(int i) const {
-    if (selected_[i] == emptySquare || selected_[i] == fullSquare) return false;
-    for (int e = 0; e < 4; ++e)
-      if (!(selected_[i] >> e & 1) && quarterAcross(i, e)) return true;
-    return false;
-  }
-
-  /// Tries the states of square i alone, then with each of its neighbours; keeps the best that is better.
-  bool improve(int i) {
-    if (tryStates(i, -1)) return true;
-    bool improved = false;
-    for (int j : Q_.squares[i].across)
-      if (survey_.free[j]) improved |= tryStates(i, j);
-    return improved;
-  }
-
-  bool tryStates(int i, int j) {
-    constexpr double least = 1e-9;  // a fall of E below rounding is none
-    const unsigned char oldI = selected_[i], oldJ = j < 0 ? emptySquare : selected_[j];
-    const Local before = local(i, j);
-    double bestE = before.E - least;
-    unsigned char bestI = oldI, bestJ = oldJ;
-    const int count = halves_ ? 6 : 2;
-    for (int a = 0; a < count; ++a) {
-      if (!isAllowed(i, states_[a])) continue;
-      for (int b = 0; b < (j < 0 ? 1 : count); ++b) {
-        if (j >= 0 && !isAllowed(j, states_[b])) continue;
-        selected_[i] = states_[a];
-        if (j >= 0) selected_[j] = states_[b];
-        const Local now = local(i, j);
-        if (now.E < bestE && now.chi == before.chi && isClean(i) && (j < 0 || isClean(j)))
-          bestE = now.E, bestI = states_[a], bestJ = states_[b];
-      }
-    }
-    selected_[i] = bestI;
-    if (j >= 0) selected_[j] = bestJ;
-    return bestI != oldI || (j >= 0 && bestJ != oldJ);
-  }
-
-  const SquareSurface& Q_;
-  const Survey& survey_;
-  int side_;
-  Selection& selected_;
-  bool halves_ = false;
-};
-
-}  // namespace
-
-namespace {
-
-/// 5000 × the area mean over S of max(0, dist(S, S_M)/h − 1.1)²: S must be near its approximation.
-double uncovered(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
-                 const Selection& selected) {
-  constexpr double weight = 5000, allowed = 1.1;
-  std::vector<std::array<int, 3>> triangles;
-  for (std::size_t i = 0; i < selected.size(); ++i)
-    if (selected[i]) {
-      const auto& n = Q.squares[i].node;
-      triangles.push_back({n[0], n[1], n[2]});
-      triangles.push_back({n[0], n[2], n[3]});
-    }
-  const TriangleTree tree(M.x, triangles);
-  double sum = 0, area = 0;
-  for (const std::array<int, 3>& t : S.S.triangles) {
-    const Vec3 a = S.S.points[t[0]], b = S.S.points[t[1]], c = S.S.points[t[2]];
-    const double part = .5 * norm(cross(b - a, c - a));
-    const double far = tree.closest((1. / 3) * (a + b + c)).distance / Q.h - allowed;
-    area += part;
-    if (far > 0) sum += part * far * far;
-  }
-  return weight * sum / area;
-}
-
-/// Marks for each sharp corner of S the nearest node of this side.
-void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
-                      Survey& survey) {
-  const RimCorners corners = rimCorners(S);
-  for (int c = 0; c < 4; ++c) {
-    if (!corners.sharp[c]) continue;
-    const Vec3 point = S.S.points[S.rim[corners.at[c]]];
-    int nearest = -1;
-    for (int n : Q.nodes)
-      if (survey.side[n] == side &&
-          (nearest < 0 || norm2(M.x[n] - point) < norm2(M.x[nearest] - point)))
-        nearest = n;
-    if (nearest >= 0) survey.sharp[nearest] = 1;
-  }
-}
-
-}  // namespace
-
-Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
-                             Outline outline) {
-  constexpr int maxRounds = 50;
-  Survey survey = surveySquares(M, Q, S);
-  markSharpCorners(M, Q, S, side, survey);
-  Extraction result;
-  result.selected = selectSquares(Q, survey, side);
-  RimRegularization rim(Q, survey, side, result.selected);
-  if (outline == Outline::paper) {
-    for (int round = 0; round < maxRounds; ++round) {
-      bool changed = removeThinProtrusions(Q, result.selected);
-      changed |= fillHighConnectivityNodes(M, Q, result.selected);
-      if (!changed) break;
-    }
-    keepLargestPart(Q, survey, result.selected);
-  } else {
-    rim.run(false);
-    if (outline == Outline::halfSquares) rim.run(true);
-  }
-  result.fault = diskFault(Q, result.selected);
-  if (result.fault.empty()) result.energy = rim.energy() + uncovered(M, Q, S, result.selected);
-  return result;
-}
-
-namespace {
-
-/// The faces labelled k, and the square and quarter of ∂T where each lies.
-int quarterOf(const Mesh& M, const SquareSurface& Q, int square, std::array<int, 3> face) {
-  const Vec3 middle = (1. / 3) * (M.xi[face[0]] + M.xi[face[1]] + M.xi[face[2]]);
-  const std::array<int, 4>& n = Q.squares[square].node;
-  const Vec3 a = M.xi[n[0]], e1 = M.xi[n[1]] - a, e2 = M.xi[n[3]] - a;
-  const double s = dot(middle - a, e1) / norm2(e1), t = dot(middle - a, e2) / norm2(e2);
-  // the diagonals s = t and s + t = 1 part the square
-  return t < s ? (s + t < 1 ? 0 : 1) : (s + t < 1 ? 3 : 2);
-}
-
-}  // namespace
-
-void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A, const Selection& selected,
-                  int k) {
-  Mesh& M = B.M;
-  const Lattice lattice(Q.level);
-  KeyMap squareAt(Q.keys.size());
-  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
-  std::array<std::int64_t, 3> half;
-  for (int E : elementsOf(A.T))
-    for (int i = 0; i < 4; ++i) {
-      const int other = B.neighbour[E][i];
-      if (other < 0 || A.T[other]) continue;
-      if (!lattice.squareOf(M, faceOpposite(M.tets[E], i), half)) continue;
-      const int square = squareAt.get(Lattice::key(half)) - 1;
-      if (square < 0 || !selected[square]) continue;
-      M.faceLabel[E][i] = k;
-      auto& back = B.neighbour[other];
-      M.faceLabel[other][std::find(back.begin(), back.end(), E) - back.begin()] = k;
-    }
-  // A half whose cut is not the mesh's diagonal: bisect that diagonal, the cut appears.
-  for (std::size_t i = 0; i < selected.size(); ++i) {
-    if (selected[i] == emptySquare || selected[i] == fullSquare) continue;
-    const Square& s = Q.squares[i];
-    // halves 3 and 12 (corners 0,1,2 / 2,3,0) are cut from corner 0 to 2, 6 and 9 from 1 to 3
-    const int cut = selected[i] == 3 || selected[i] == 12 ? 0 : 1;
-    if (s.diagonal != cut) B.bisectEdge(s.node[1 - cut], s.node[3 - cut]);
-  }
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
-    for (int i = 0; i < 4; ++i) {
-      if (M.faceLabel[E][i] != k) continue;
-      const std::array<int, 3> face = faceOpposite(M.tets[E], i);
-      lattice.squareOf(M, face, half);
-      const int square = squareAt.get(Lattice::key(half)) - 1;
-      if (!(selected[square] >> quarterOf(M, Q, square, face) & 1)) M.faceLabel[E][i] = 0;
-    }
-}
-
-namespace {
-
-/// S_M as a complex: its nodes, edges and rim, read off the labelled faces.
-struct SurfaceComplex {
-  std::vector<char> node;                          // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
-  KeyMap edges;                                    // edge → times seen (twice a face): 2 rim, 4 inside
-  std::vector<std::pair<int, int>> edgeList;
-  SurfaceComplex(const Mesh& M, int k) : node(M.x.size(), 0) {
-    for (std::size_t E = 0; E < M.tets.size(); ++E)
-      for (int i = 0; i < 4; ++i) {
-        if (M.faceLabel[E][i] != k) continue;
-        const std::array<int, 3> v = faceOpposite(M.tets[E], i);
-        for (int e = 0; e < 3; ++e) {
-          node[v[e]] = 1;
-          if (edges[edgeKey(v[e], v[(e + 1) % 3])]++ == 0) edgeList.push_back({v[e], v[(e + 1) % 3]});
-        }
-      }
-    for (const auto& [a, b] : edgeList)
-      if (isRimEdge(a, b)) node[a] = node[b] = 2;
-  }
-  bool isEdge(int a, int b) const { return edges.get(edgeKey(a, b)) > 0; }
-  bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 2; }
-};
-
-constexpr int tetEdges[6][2] = {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}};
-
-/// Bisects the edges; true where there were any.
-bool bisectEdges(Bisection& B, const std::vector<std::pair<int, int>>& edges) {
-  for (const auto& [a, b] : edges) B.bisectEdge(a, b);
-  return !edges.empty();
-}
-
-}  // namespace
-
-bool refineTetrahedraWithTwoFaces(Bisection& B, int k) {
-  std::vector<std::pair<int, int>> refine;  // tetrahedron, level
-  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
-    const std::array<int, 4>& label = B.M.faceLabel[E];
-    if (std::count(label.begin(), label.end(), k) > 1)
-      refine.push_back({static_cast<int>(E), B.M.level[E]});
-  }
-  for (const auto& [E, level] : refine)
-    if (B.M.level[E] == level) B.bisect(E);
-  return !refine.empty();
-}
-
-bool refineFacesWithTwoRimEdges(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
-  std::vector<std::pair<int, int>> refine;
-  for (const std::array<int, 4>& z : B.M.tets)
-    for (int i = 0; i < 4; ++i) {
-      const std::array<int, 3> v = faceOpposite(z, i);
-      if (SM.node[v[0]] != 2 || SM.node[v[1]] != 2 || SM.node[v[2]] != 2) continue;
-      int rimEdges = 0;
-      for (int e = 0; e < 3; ++e) rimEdges += SM.isRimEdge(v[e], v[(e + 1) % 3]);
-      if (rimEdges > 1) refine.push_back(refinementEdge(B.M, v));
-    }
-  return bisectEdges(B, refine);
-}
-
-bool refineEdgesAcrossTheRim(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
-  std::vector<std::pair<int, int>> refine;
-  for (const auto& [a, b] : SM.edgeList)
-    if (SM.node[a] == 2 && SM.node[b] == 2 && !SM.isRimEdge(a, b)) refine.push_back({a, b});
-  return bisectEdges(B, refine);
-}
-
-bool refineEdgesBetweenSurfaces(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
-  const std::size_t before = B.M.tets.size();
-  std::vector<std::pair<int, int>> refine;
-  for (const std::array<int, 4>& z : B.M.tets)
-    for (const auto& e : tetEdges) {
-      const int a = z[e[0]], b = z[e[1]];
-      if ((SM.node[a] && B.M.dimension[b] < 3 && !SM.node[b]) ||
-          (SM.node[b] && B.M.dimension[a] < 3 && !SM.node[a]))
-        refine.push_back({a, b});
-    }
-  bisectEdges(B, refine);
-  return B.M.tets.size() > before;
-}
-
-bool refineToFullSubcomplex(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
-  std::vector<std::pair<int, int>> refine;
-  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
-    const std::array<int, 4>& z = B.M.tets[E];
-    for (const auto& e : tetEdges)
-      if (SM.node[z[e[0]]] && SM.node[z[e[1]]] && !SM.isEdge(z[e[0]], z[e[1]]))
-        refine.push_back({z[e[0]], z[e[1]]});
-    for (int i = 0; i < 4; ++i) {
-      const std::array<int, 3> v = faceOpposite(z, i);
-      if (B.M.faceLabel[E][i] != k && SM.isEdge(v[0], v[1]) && SM.isEdge(v[1], v[2]) &&
-          SM.isEdge(v[2], v[0]))
-        refine.push_back(refinementEdge(B.M, v));
-    }
-  }
-  return bisectEdges(B, refine);
-}
-
-int surfaceHealing(Bisection& B, int k) {
-  constexpr int maxRounds = 30;  // [choice] rounds end after 2 to 5 where they end
-  for (int round = 1; round <= maxRounds; ++round) {
-    bool changed = refineTetrahedraWithTwoFaces(B, k);
-    changed |= refineFacesWithTwoRimEdges(B, k);
-    changed |= refineEdgesAcrossTheRim(B, k);
-    changed |= refineEdgesBetweenSurfaces(B, k);
-    changed |= refineToFullSubcomplex(B, k);
-    if (!changed) return round;
-  }
-  throw MethodError("insertSurface (§3.5): the rules of surface healing do not settle after " +
-                    std::to_string(maxRounds) + " rounds; lower l_c");
-}
-
 // ==== 3. Surface insertion =======================================================================
 
 InsertOptions InsertOptions::paper() {
@@ -3513,7 +3511,7 @@ InsertOptions InsertOptions::paper() {
 namespace {
 
 /// What §3.1 asks of M: a valid meccano mesh.
-void checkMesh(const Mesh& M) {
+void checkMeccano(const Mesh& M) {
   const std::size_t nodes = M.x.size(), tets = M.tets.size();
   if (tets == 0) throw InputError("insertSurface (§3.1): the mesh has no tetrahedra");
   if (M.xi.size() != nodes)
@@ -3590,7 +3588,6 @@ struct Insertion {
   Approximation A;
   SquareSurface Q;
   int k;               // number of the new surface
-  std::vector<std::string> faults;  // why ways were left
 
   void stage(const char* name, const Mesh& mesh) const {
     if (options.onStage) options.onStage(name, mesh);
@@ -3605,23 +3602,18 @@ std::string describe(const Way& way) {
          (way.outline == Outline::halfSquares ? "half squares" : "whole squares");
 }
 
-/// §3.4 on both sides: the ways to go on, best first.
-std::vector<Way> extractWays(Insertion& I) {
-  std::vector<Outline> outlines{I.options.outline};
-  if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
+/// §3.4 on both sides: the ways to go on with this outline, best first.
+std::vector<Way> extractWays(const Insertion& I, Outline outline, std::vector<std::string>& faults) {
   std::vector<Way> ways;
-  for (int side : {1, -1})
-    for (Outline outline : outlines) {
-      Way way{side, outline, surfaceExtraction(I.M, I.Q, I.S, side, outline)};
-      if (way.extraction.fault.empty())
-        ways.push_back(std::move(way));
-      else
-        I.faults.push_back(describe(way) + ": S_M is no disk (" + way.extraction.fault + ")");
-    }
-  std::stable_sort(ways.begin(), ways.end(), [](const Way& a, const Way& b) {
-    if (a.outline != b.outline) return a.outline == Outline::halfSquares;
-    return a.extraction.energy < b.extraction.energy;
-  });
+  for (int side : {1, -1}) {
+    Way way{side, outline, surfaceExtraction(I.M, I.Q, I.S, side, outline)};
+    if (way.extraction.fault.empty())
+      ways.push_back(std::move(way));
+    else
+      faults.push_back(describe(way) + ": S_M is no disk (" + way.extraction.fault + ")");
+  }
+  if (ways.size() == 2 && ways[1].extraction.energy < ways[0].extraction.energy)
+    std::swap(ways[0], ways[1]);
   return ways;
 }
 
@@ -3691,11 +3683,28 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
                               " along S, more than 2 cube edges; lower l_c");
 }
 
-/// One l_c: 3.2 to 3.7, all ways until one is good; the best valid one. False where none is valid.
+/// Follows one way; keeps its mesh and report where it is the best valid one so far.
+void tryWay(const Insertion& I, const Way& way, double lc, Mesh& result, InsertReport& report,
+            std::vector<std::string>& faults) {
+  Mesh trial = I.M;
+  InsertReport now;
+  now.original = report.original, now.warnings = report.warnings;
+  now.surface = I.k, now.lc = lc;
+  try {
+    follow(I, way, trial, now);
+  } catch (const Error& error) {
+    faults.push_back(describe(way) + ": " + error.what());
+    return;
+  }
+  if (report.surface == 0 || now.smoothed.min > report.smoothed.min)
+    report = now, result = std::move(trial);
+}
+
+/// One l_c: 3.2 to 3.7 on all ways until one is good; the best valid one. False where none is valid.
 bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions& options, double lc,
                     Mesh& result, InsertReport& report, std::vector<std::string>& faults) {
   constexpr double goodQuality = .45;  // [choice] below it the other ways are tried too
-  Insertion I{S, options, M, {}, {}, static_cast<int>(M.surfaces.size()) + 1, {}};
+  Insertion I{S, options, M, {}, {}, static_cast<int>(M.surfaces.size()) + 1};
   Bisection B(I.M);
   I.A = volumetricApproximation(B, S, lc);
   I.stage("refined", I.M);
@@ -3704,32 +3713,24 @@ bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions
   I.stage("healed", I.M);
   I.progress("3.2-3.3 approximation: " + std::to_string(I.M.tets.size()) + " tetrahedra, " +
              std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
-  const bool first = options.outline == Outline::paper;
-  bool valid = false;
-  for (const Way& way : extractWays(I)) {
-    Mesh trial = I.M;
-    InsertReport now = report;
-    now.surface = I.k, now.lc = lc;
-    try {
-      follow(I, way, trial, now);
-      measureSurface(trial, S, I.Q.h, now);
-    } catch (const Error& error) {
-      faults.push_back(describe(way) + ": " + error.what());
-      continue;
-    }
-    if (!valid || now.smoothed.min > report.smoothed.min) report = now, result = std::move(trial);
-    valid = true;
-    if (first || report.smoothed.min >= goodQuality) break;
-  }
-  faults.insert(faults.begin(), I.faults.begin(), I.faults.end());
-  return valid;
+  std::vector<Outline> outlines{options.outline};
+  if (options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
+  const double good = options.outline == Outline::paper ? 0 : goodQuality;
+  auto isGood = [&] { return report.surface > 0 && report.smoothed.min >= good; };
+  for (Outline outline : outlines)
+    if (!isGood())
+      for (const Way& way : extractWays(I, outline, faults))
+        if (!isGood()) tryWay(I, way, lc, result, report, faults);
+  if (report.surface == 0) return false;
+  measureSurface(result, S, I.Q.h, report);
+  return true;
 }
 
 }  // namespace
 
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
   constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
-  checkMesh(M);
+  checkMeccano(M);
   if (!(options.lc > 0) || !std::isfinite(options.lc))
     throw InputError("insertSurface (§3.2): l_c = " + number(options.lc) + " must be above 0");
   InsertReport report;

@@ -270,7 +270,7 @@ const Parametrization& surfaceOf(const Mesh& M, int label);
 /// Faces labelled k (S_M of inserted surface k, or boundary patch -k), each once. [faces], node indices
 std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
 
-// ---- 3.1 Problem statement ---------------------------------------------------------------------
+// ==== 3.1 Problem statement =====================================================================
 
 /// [§3.1] S as the method needs it: a disk, with one orientation and one rim. Welds exactly
 /// coincident points, drops duplicate and zero-area triangles and unused points, turns triangles
@@ -288,7 +288,7 @@ std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S);
 /// The rims of a consistently oriented surface, each a closed loop of points with S on its left.
 std::vector<std::vector<int>> rimLoops(const TriangleSurface& S);
 
-// ---- Tools for 3.2 and 3.4: distance to S ------------------------------------------------------
+// ==== Tools for 3.2 and 3.4: distance to S ======================================================
 
 /// The point of a triangle nearest to a given one, and the feature it lies in the interior of.
 enum class Feature { face, edge, vertex };
@@ -390,94 +390,6 @@ Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
 /// Two-sided Hausdorff distance, sampled: each triangle at a lattice of samplesPerEdge >= 1 steps.
 double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge);
 
-// ---- Tools for 3.6: sparse iterative solver ----------------------------------------------------
-
-/// A square matrix in compressed rows; columns ascend within a row.
-struct SparseMatrix {
-  std::vector<int> start;      // [rows + 1]
-  std::vector<int> column;     // [entries]
-  std::vector<double> value;   // [entries]
-};
-
-/// Solves A x = b by BiCGSTAB, preconditioned by relaxed ILU(0) (Jacobi where a pivot vanishes).
-///   x          start value on entry, the solution on return
-///   tolerance  of |b - A x| / |b|
-///   returns    the iterations
-///   errors     SolverError, with the residual reached
-int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
-                  double tolerance = 1e-12, int maxIterations = 5000);
-
-// ---- 3.6 Surface projection --------------------------------------------------------------------
-
-/// [§3.6, after 18] tan(α/2) of the angle between a and b: |a×b| / (|a||b| + a·b), or for
-/// obtuse angles its twin (|a||b| − a·b) / |a×b|; finite: α within 1e-8 of π counts as that.
-double tanHalfAngle(Vec3 a, Vec3 b);
-
-/// [§3.6, after 18] Floater's mean value weights λ_ij, positive and of sum 1 in the row of an inner
-/// point i: proportional to (tan(α_{j-1}/2) + tan(α_j/2)) / |x_j − x_i|. Rows of fixed points are
-/// empty.
-SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
-                              const std::vector<std::array<int, 3>>& triangles,
-                              const std::vector<char>& fixed);
-
-/// [§3.6, eq. (3)] Floater's parameterization: rim points keep u, inner ones get u_i = Σ λ_ij u_j.
-///   u       [points], set at the rim (convex loop, counter-clockwise)
-///   errors  SolverError; MethodError where a parametric triangle is not counter-clockwise
-std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
-                                         const std::vector<std::array<int, 3>>& triangles,
-                                         const std::vector<char>& isRim, std::vector<Vec2> u);
-
-/// [§3.6 departure] (1 + μ_i) u_i − Σ λ_ij u_j = μ_i a_i inside pulls u_i to its anchor a_i.
-std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
-                                          const std::vector<char>& isRim, std::vector<Vec2> u,
-                                          const std::vector<double>& mu,
-                                          const std::vector<Vec2>& anchor);
-
-/// Triangles of 𝓤 that are not counter-clockwise.
-std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangles,
-                                  const std::vector<Vec2>& u);
-
-/// [§3.6, case 5 for S itself] Bisects inner edges that join two rim points (the third edge of an
-/// ear is one), which would make ϕ degenerate. Adds points on edges: the geometry of S stays.
-/// Afterwards there are at least four rim points.
-void splitChords(TriangleSurface& S);
-
-/// [§3.6 choice] The four rim points that go to the corners of 𝓤, in order along the rim.
-struct RimCorners {
-  std::array<int, 4> at;      // positions in the rim loop, ascending
-  std::array<bool, 4> sharp;  // a corner of the geometry: its node will stay fixed
-};
-RimCorners rimCorners(const SurfaceDistance& S);
-
-/// [§3.6, eq. (3)] ϕ: 𝓤 → S with its rim as a closed curve that starts at a corner; the four arcs
-/// between the corners go to the four sides of 𝓤 by arc length.
-struct SurfaceParametrization {
-  Parametrization surface;        // S with chords split; without locator
-  Curve rim;                      // sides[0].u at its points; its surface number is not yet set
-  std::array<double, 4> cornerS;  // arc length of the four corners, the first is 0
-  std::array<bool, 4> sharp;
-};
-SurfaceParametrization parametrizeSurface(const SurfaceDistance& S);
-
-struct ProjectionReport {
-  double tangentialShift = 0;     // largest distance of x' from the point of S nearest to x
-  int shiftedNode = -1;           // where
-  int flipped = 0;                // parametric triangles folded by the anchors, before the remedy
-  int rounds = 0;                 // solves of S_M's equations
-  std::vector<int> cornerNodes;   // nodes fixed at sharp corners
-};
-
-/// [§3.6, eq. (3), (4)] Moves the nodes of S_M (faces labelled k = M.surfaces.size() + 1, a disk)
-/// onto S: x' = ϕ(ϕ_M⁻¹(x)). Appends S to M.surfaces, its rim to M.curves, fixed sharp corners to
-/// M.corners, and sets dimension, entity, parameter and x of the nodes.
-///   S          has passed checkSurface()
-///   followRim  [departure] S_M's rim follows the nearest rim of S, and its equations are anchored
-///              (anchoredParametrization); false: plain, and both rims by arc length between four
-///              corners [choice]
-///   errors     MethodError: S_M is no disk or folds in 𝓤; SolverError. M may then be half changed:
-///              work on a copy
-ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& S, bool followRim);
-
 // ==== 3.2 Volumetric approximation ==============================================================
 
 /// Whether the closed triangle meets the closed tetrahedron (relative tolerance 1e-9).
@@ -577,6 +489,94 @@ bool refineToFullSubcomplex(Bisection& B, int k);
 /// [§3.5] Cases 3 to 6 and the full subcomplex until nothing changes.
 ///   returns rounds;  errors  MethodError after 30
 int surfaceHealing(Bisection& B, int k);
+
+// ==== Tools for 3.6: sparse iterative solver ====================================================
+
+/// A square matrix in compressed rows; columns ascend within a row.
+struct SparseMatrix {
+  std::vector<int> start;      // [rows + 1]
+  std::vector<int> column;     // [entries]
+  std::vector<double> value;   // [entries]
+};
+
+/// Solves A x = b by BiCGSTAB, preconditioned by relaxed ILU(0) (Jacobi where a pivot vanishes).
+///   x          start value on entry, the solution on return
+///   tolerance  of |b - A x| / |b|
+///   returns    the iterations
+///   errors     SolverError, with the residual reached
+int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
+                  double tolerance = 1e-12, int maxIterations = 5000);
+
+// ==== 3.6 Surface projection ====================================================================
+
+/// [§3.6, after 18] tan(α/2) of the angle between a and b: |a×b| / (|a||b| + a·b), or for
+/// obtuse angles its twin (|a||b| − a·b) / |a×b|; finite: α within 1e-8 of π counts as that.
+double tanHalfAngle(Vec3 a, Vec3 b);
+
+/// [§3.6, after 18] Floater's mean value weights λ_ij, positive and of sum 1 in the row of an inner
+/// point i: proportional to (tan(α_{j-1}/2) + tan(α_j/2)) / |x_j − x_i|. Rows of fixed points are
+/// empty.
+SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
+                              const std::vector<std::array<int, 3>>& triangles,
+                              const std::vector<char>& fixed);
+
+/// [§3.6, eq. (3)] Floater's parameterization: rim points keep u, inner ones get u_i = Σ λ_ij u_j.
+///   u       [points], set at the rim (convex loop, counter-clockwise)
+///   errors  SolverError; MethodError where a parametric triangle is not counter-clockwise
+std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
+                                         const std::vector<std::array<int, 3>>& triangles,
+                                         const std::vector<char>& isRim, std::vector<Vec2> u);
+
+/// [§3.6 departure] (1 + μ_i) u_i − Σ λ_ij u_j = μ_i a_i inside pulls u_i to its anchor a_i.
+std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
+                                          const std::vector<char>& isRim, std::vector<Vec2> u,
+                                          const std::vector<double>& mu,
+                                          const std::vector<Vec2>& anchor);
+
+/// Triangles of 𝓤 that are not counter-clockwise.
+std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangles,
+                                  const std::vector<Vec2>& u);
+
+/// [§3.6, case 5 for S itself] Bisects inner edges that join two rim points (the third edge of an
+/// ear is one), which would make ϕ degenerate. Adds points on edges: the geometry of S stays.
+/// Afterwards there are at least four rim points.
+void splitChords(TriangleSurface& S);
+
+/// [§3.6 choice] The four rim points that go to the corners of 𝓤, in order along the rim.
+struct RimCorners {
+  std::array<int, 4> at;      // positions in the rim loop, ascending
+  std::array<bool, 4> sharp;  // a corner of the geometry: its node will stay fixed
+};
+RimCorners rimCorners(const SurfaceDistance& S);
+
+/// [§3.6, eq. (3)] ϕ: 𝓤 → S with its rim as a closed curve that starts at a corner; the four arcs
+/// between the corners go to the four sides of 𝓤 by arc length.
+struct SurfaceParametrization {
+  Parametrization surface;        // S with chords split; without locator
+  Curve rim;                      // sides[0].u at its points; its surface number is not yet set
+  std::array<double, 4> cornerS;  // arc length of the four corners, the first is 0
+  std::array<bool, 4> sharp;
+};
+SurfaceParametrization parametrizeSurface(const SurfaceDistance& S);
+
+struct ProjectionReport {
+  double tangentialShift = 0;     // largest distance of x' from the point of S nearest to x
+  int shiftedNode = -1;           // where
+  int flipped = 0;                // parametric triangles folded by the anchors, before the remedy
+  int rounds = 0;                 // solves of S_M's equations
+  std::vector<int> cornerNodes;   // nodes fixed at sharp corners
+};
+
+/// [§3.6, eq. (3), (4)] Moves the nodes of S_M (faces labelled k = M.surfaces.size() + 1, a disk)
+/// onto S: x' = ϕ(ϕ_M⁻¹(x)). Appends S to M.surfaces, its rim to M.curves, fixed sharp corners to
+/// M.corners, and sets dimension, entity, parameter and x of the nodes.
+///   S          has passed checkSurface()
+///   followRim  [departure] S_M's rim follows the nearest rim of S, and its equations are anchored
+///              (anchoredParametrization); false: plain, and both rims by arc length between four
+///              corners [choice]
+///   errors     MethodError: S_M is no disk or folds in 𝓤; SolverError. M may then be half changed:
+///              work on a copy
+ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& S, bool followRim);
 
 // ==== 3.7 Mesh optimization (optimize.cpp) ======================================================
 // J = Jφ: ideal (computational) element → physical element, both with the vertices in the same order.

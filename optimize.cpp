@@ -24,7 +24,7 @@
 namespace meccano {
 namespace {
 
-constexpr double infinity = std::numeric_limits<double>::infinity();
+constexpr double unbounded = std::numeric_limits<double>::infinity();  // f of an inverted element
 
 // ==== Tools for 3.7: one element as a function of one of its nodes ==============================
 
@@ -87,7 +87,7 @@ struct Regularized {
 };
 inline Regularized regularized(double N, double sigma, double delta) {
   if (delta == 0) {
-    if (!(sigma > 0)) return {infinity, 0};
+    if (!(sigma > 0)) return {unbounded, 0};
     const double y = inverseCubeRoot(sigma);
     return {N * y * y / 3, sigma};
   }
@@ -120,8 +120,8 @@ constexpr double convexRatio =
 inline void addElement(const Moving& e, double delta, const Penalty& phi, double minRatio,
                        double& f, Vec3& gradient, Symmetric& H) {
   const Regularized at = regularized(e.N, e.sigma, delta);
-  if (at.eta == infinity) {
-    f = infinity;
+  if (at.eta == unbounded) {
+    f = unbounded;
     return;
   }
   const PenaltyTerms p = penaltyTerms(at.eta, phi);
@@ -157,7 +157,7 @@ double valueOf(const std::vector<Moving>& star, Vec3 d, double delta, const Pena
   for (const Moving& e : star) {
     const double N = e.N + 2 * dot(e.v, d) + e.gg * norm2(d);
     const double distortion = regularized(N, e.sigma + dot(e.s, d), delta).eta;
-    if (distortion == infinity) return infinity;
+    if (distortion == unbounded) return unbounded;
     sum += penaltyTerms(distortion, phi).value;
   }
   return sum;
@@ -172,7 +172,7 @@ LinePoint alongLine(const std::vector<Moving>& star, Vec3 p, double t, double de
     const double vp = dot(e.v, p), sp = dot(e.s, p);
     const double N = e.N + t * (2 * vp + t * e.gg * pp);
     const Regularized r = regularized(N, e.sigma + t * sp, delta);
-    if (r.eta == infinity) return {infinity, 0};
+    if (r.eta == unbounded) return {unbounded, 0};
     const PenaltyTerms terms = penaltyTerms(r.eta, phi);
     at.F += terms.value;
     at.slope += 2 * terms.first * ((vp + t * e.gg * pp) / std::max(N, DBL_MIN) - sp / (3 * r.R));
@@ -250,7 +250,7 @@ bool solveCholesky(const Mat3& A, Vec3 b, Vec3& p) {
 
 double eta(const Mat3& J) {
   const double sigma = std::abs(det(J));
-  return sigma > 0 ? norm2(J) / (3 * std::cbrt(sigma * sigma)) : infinity;  // eq. (5)
+  return sigma > 0 ? norm2(J) / (3 * std::cbrt(sigma * sigma)) : unbounded;  // eq. (5)
 }
 
 Mat3 jacobian(const std::array<Vec3, 4>& ideal, const std::array<Vec3, 4>& physical) {
@@ -269,7 +269,7 @@ double h(double sigma, double delta) {
 
 double etaRegularized(const Mat3& J, double delta) {
   const double hs = h(det(J), delta);
-  return hs > 0 ? norm2(J) / (3 * std::cbrt(hs * hs)) : infinity;
+  return hs > 0 ? norm2(J) / (3 * std::cbrt(hs * hs)) : unbounded;
 }
 
 double chooseDelta(double sigmaMin, double mu) {
@@ -305,7 +305,7 @@ Objective fDerivatives(const Star& star, Vec3 x, double delta, double power) {
 
 double fVarphi(const Star& star, const Parametrization& P, Vec2 u, double delta, double power) {
   const Location at = locate(P, u);
-  return at.triangle < 0 ? infinity : f(star, varphi(P, at), delta, power);  // eq. (10)
+  return at.triangle < 0 ? unbounded : f(star, varphi(P, at), delta, power);  // eq. (10)
 }
 
 double fGamma(const Star& star, const Curve& C, double s, double delta, double power) {
@@ -600,8 +600,8 @@ void buildFreedom(Smoother& S) {
   for (int n : S.options.fixed) S.freedom[n] = 0;
   for (std::size_t n = 0; n < nodes; ++n)
     if (S.starStart[n] == S.starStart[n + 1]) S.freedom[n] = 0;
-  S.unrest.assign(nodes, S.options.active.empty() ? infinity : 0);
-  for (int n : S.options.active) S.unrest[n] = infinity;
+  S.unrest.assign(nodes, S.options.active.empty() ? unbounded : 0);
+  for (int n : S.options.active) S.unrest[n] = unbounded;
 }
 
 // ---- measures ----------------------------------------------------------------------------------
@@ -623,7 +623,7 @@ struct Validity {
   double sigmaMin;
 };
 Validity validity(const Smoother& S) {
-  Validity v{0, infinity};
+  Validity v{0, unbounded};
   for (int E = 0; E < static_cast<int>(S.M.tets.size()); ++E) {
     const double sigma = elementFromItsFirst(S, E).sigma;
     if (!(sigma > 0)) ++v.inverted;
@@ -647,7 +647,7 @@ struct Edges {
 // Fills S.around with the star of n.
 Edges gatherStar(Smoother& S, int n) {
   const Vec3 x = S.M.x[n];
-  Edges edges{infinity, 0};
+  Edges edges{unbounded, 0};
   S.around.clear();
   for (int k = S.starStart[n]; k < S.starStart[n + 1]; ++k) {
     const StarEntry& e = S.star[k];
@@ -758,7 +758,7 @@ double visitSliding(Smoother& S, int n, const Edges& edges) {
   const Vec3 x = S.M.x[n];
   const auto F = [&](Vec3 p) {
     const Slid at = slide(S.M, n, p);
-    return at.inside ? valueOf(S.around, at.x - x, S.delta, S.phi) : infinity;
+    return at.inside ? valueOf(S.around, at.x - x, S.delta, S.phi) : unbounded;
   };
   Objective o = inParameters(objectiveOf(S.around, S.delta, S.phi), frame);
   if (frame.count == 0 || !std::isfinite(o.f)) return 0;
@@ -830,7 +830,7 @@ constexpr double volumeWeight = 1;
 ///   source  Garanzha et al., Foldover-free maps in 50 lines of code
 Functional meshFunctional(const Smoother& S, double delta, std::vector<Vec3>& gradient,
                           std::vector<double>& diagonal) {
-  Functional sum{0, infinity};
+  Functional sum{0, unbounded};
   std::fill(gradient.begin(), gradient.end(), Vec3{});
   std::fill(diagonal.begin(), diagonal.end(), 0);
   for (std::size_t E = 0; E < S.M.tets.size(); ++E) {
@@ -844,7 +844,7 @@ Functional meshFunctional(const Smoother& S, double delta, std::vector<Vec3>& gr
     const double hs = h(sigma, delta);
     sum.F += r.eta + volumeWeight * (1 + sigma * sigma) / (2 * hs);
     sum.sigmaMin = std::min(sum.sigmaMin, sigma);
-    if (r.eta == infinity) continue;
+    if (r.eta == unbounded) continue;
     const double volumeSlope = volumeWeight * (2 * sigma - (1 + sigma * sigma) / r.R) / (2 * hs);
     const Mat3 D =
         (2 * r.eta / N) * J + (volumeSlope - 2. / 3 * r.eta / r.R) * cofactor(J);  // ∂/∂J
@@ -922,7 +922,7 @@ Functional descend(Smoother& S, double delta) {
       trial = meshFunctional(S, delta, trialGradient, trialDiagonal);
       return LinePoint{trial.F, product(trialGradient, p)};
     };
-    const WolfeStep step = wolfeSearch(goTo, {at.F, slope}, 1, infinity);
+    const WolfeStep step = wolfeSearch(goTo, {at.F, slope}, 1, unbounded);
     if (step.t == 0 || !step.curvature) goTo(step.t);
     const bool little = at.F - trial.F < lbfgsDecrease * at.F;
     std::vector<Vec3> y = trialGradient, d = p;
@@ -947,10 +947,10 @@ constexpr double validDelta = 1e-10;  // where no element is inverted: below any
 ///   source  δ from the last decrease of F: Garanzha et al.
 void globalDescent(Smoother& S) {
   Validity v = validity(S);
-  double delta = firstDelta, last = infinity;
+  double delta = firstDelta, last = 0;
   for (int round = 0; round < descentRounds && v.inverted > 0 && sweepsLeft(S); ++round) {
     const Functional at = descend(S, delta);
-    const double decrease = std::max(1 - at.F / last, leastDecrease);
+    const double decrease = round == 0 ? leastDecrease : std::max(1 - at.F / last, leastDecrease);
     const double mu = (1 - decrease) * h(at.sigmaMin, delta);
     delta = at.sigmaMin < mu ? std::sqrt(mu * (mu - at.sigmaMin)) : validDelta;
     last = at.F;
@@ -1002,7 +1002,7 @@ bool untangleAndSmooth(Smoother& S) {
         S.M.parameter = initialParameter;
         globalDescent(S);
         schedule = {};
-        std::fill(S.unrest.begin(), S.unrest.end(), infinity);
+        std::fill(S.unrest.begin(), S.unrest.end(), unbounded);
         continue;
       }
       S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted)) : 0;
@@ -1058,7 +1058,7 @@ void liftRound(Smoother& S, const WorstElements& worst, double power) {
   S.wake = liftWake;
   for (std::size_t E = 0; E < S.M.tets.size(); ++E)
     if (elementQuality(S, static_cast<int>(E)) <= worst.bound / liftReach)
-      for (int n : S.M.tets[E]) S.unrest[n] = infinity;
+      for (int n : S.M.tets[E]) S.unrest[n] = unbounded;
   for (int k = 0; k < liftSweeps && sweepsLeft(S); ++k) {
     const double disp = sweepNodes(S);
     endSweep(S, disp);
@@ -1165,7 +1165,7 @@ void checkElements(const Mesh& M, const IdealElements& ideals) {
   }
 }
 
-void checkMesh(const Mesh& M) {
+void checkOptimizable(const Mesh& M) {
   checkNodes(M);
   checkElements(M, {M, Ideal::computational});
 }
@@ -1182,7 +1182,7 @@ OptimizeOptions OptimizeOptions::paper() {
 
 OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   checkOptions(options, M.x.size());
-  checkMesh(M);
+  checkOptimizable(M);
   Smoother S{M, options};
   if (M.tets.empty()) return {0, 0, true, 0, 0, 0};
   buildShapes(S);
