@@ -1340,7 +1340,7 @@ double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int sampl
 bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle) {
   constexpr double tolerance = 1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
   constexpr int faces[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
-  Vec3 polygon[8], clipped[8];  // three corners and at most one more for each plane
+  Vec3 polygon[16], clipped[16];  // three corners, one more for each plane; rounding on needles: twice that
   int corners = 3;
   for (int i = 0; i < 3; ++i) polygon[i] = triangle[i];
   for (int i = 0; i < 4; ++i) {
@@ -1427,13 +1427,17 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wa
 
 }  // namespace
 
+int cubeLevel(const Mesh& M, double lc) {
+  int level = 0;
+  for (double diagonal = norm(M.cube); diagonal >= lc; diagonal /= 2) level += 3;
+  return level;
+}
+
 Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc) {
   std::vector<Cut> cut;
   refineCut(B, S, cut, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
-  // The level of whole cubes that §3.3 completes T to; T reaches it already here.
   Approximation A;
-  for (std::size_t E = 0; E < cut.size(); ++E)
-    if (cut[E] == Cut::yes) A.level = std::max(A.level, (B.M.level[E] + 2) / 3 * 3);
+  A.level = cubeLevel(B.M, lc);
   refineCut(B, S, cut, [&](int E) { return B.M.level[E] < A.level; });
   A.T.resize(cut.size());
   for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E] == Cut::yes;
@@ -2999,26 +3003,25 @@ ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDis
   return SM;
 }
 
-/// Turns of S_M's rim at its nodes, > 0 where convex. [rim]
+/// Turns of S_M's rim at its nodes, > 0 where convex: π less the angles of its triangles there, so that
+/// a fold of S_M is no turn. [rim]
 std::vector<double> approximateTurns(const ApproximatingSurface& SM) {
-  std::vector<Vec3> normal(SM.S.points.size());
-  for (const std::array<int, 3>& t : SM.S.triangles) {
-    Vec3 a = SM.S.points[t[0]], n = cross(SM.S.points[t[1]] - a, SM.S.points[t[2]] - a);
-    for (int i : t) normal[i] += n;
-  }
-  const size_t m = SM.rim.size();
-  std::vector<double> turn(m);
-  for (size_t i = 0; i < m; ++i) {
-    Vec3 p = SM.S.points[SM.rim[i]], in = p - SM.S.points[SM.rim[(i + m - 1) % m]];
-    Vec3 out = SM.S.points[SM.rim[(i + 1) % m]] - p;
-    turn[i] = std::atan2(dot(cross(in, out), unitVector(normal[SM.rim[i]])), dot(in, out));
-  }
-  return turn;
+  constexpr double pi = 3.14159265358979323846;
+  std::vector<double> turn(SM.S.points.size(), pi);
+  for (const std::array<int, 3>& t : SM.S.triangles)
+    for (int i = 0; i < 3; ++i) {
+      const Vec3 p = SM.S.points[t[i]];
+      const Vec3 a = SM.S.points[t[(i + 1) % 3]] - p, b = SM.S.points[t[(i + 2) % 3]] - p;
+      turn[t[i]] -= std::atan2(norm(cross(a, b)), dot(a, b));
+    }
+  std::vector<double> ofRim;
+  for (int n : SM.rim) ofRim.push_back(turn[n]);
+  return ofRim;
 }
 
 /// [choice] What a convex rim node of S_M (a turn above 45 degrees) is worth as partner of a corner
 /// of S, in squared distances over h².
-constexpr double convexBonus = .5;
+constexpr double convexBonus = 1;
 /// [choice] A corner holds no node that is farther away than this, in h: it would only trap
 /// inverted elements.
 constexpr double cornerReach = 2;
@@ -3543,38 +3546,60 @@ bool contains(const Mesh& M, Vec3 p) {
   return false;
 }
 
-/// The limits of l_c, before any work: dist(∂M, S), and the size of what comes.
-void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) {
+std::string at(const Gap& gap) {
+  return " at triangle " + std::to_string(gap.triangle) + " near (" + number(gap.point.x) + ", " +
+         number(gap.point.y) + ", " + number(gap.point.z) + ")";
+}
+
+/// l_c against the distances of §3.1 and §3.2: S inside the domain, and clear of earlier surfaces.
+void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   std::vector<std::array<int, 3>> boundary;
   for (std::size_t p = 1; p <= M.patches.size(); ++p)
     for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) boundary.push_back(face);
   const Gap gap = smallestGap(S.tree, M.x, boundary);
-  const std::string where = " at triangle " + std::to_string(gap.triangle) + " near (" +
-                            number(gap.point.x) + ", " + number(gap.point.y) + ", " +
-                            number(gap.point.z) + ")";
   if (gap.distance <= 0 || !contains(M, S.S.points[0]))
     throw InputError("insertSurface (§3.1): S touches or leaves the domain" +
-                     (gap.distance <= 0 ? where : std::string()) + "; it must lie inside");
+                     (gap.distance <= 0 ? at(gap) : std::string()) + "; it must lie inside");
   if (!(lc < gap.distance))
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below dist(∂M, S) = " +
-                     number(gap.distance) + where + "; lower l_c");
+                     number(gap.distance) + at(gap) + "; lower l_c");
+  for (const Parametrization& earlier : M.surfaces) {
+    const Gap between = smallestGap(S.tree, earlier.points, earlier.triangles);
+    if (between.distance <= 0)
+      throw InputError("insertSurface (§3.1): S touches the inserted surface '" + earlier.name + "'" +
+                       at(between) + "; surfaces must not meet");
+    if (!(lc < between.distance))
+      throw InputError("insertSurface (§3.2): l_c = " + number(lc) +
+                       " is not below the distance " + number(between.distance) +
+                       " to the inserted surface '" + earlier.name + "'" + at(between) +
+                       "; lower l_c");
+  }
+}
+
+/// l_c against the size of what comes: not more tetrahedra than allowed, not smaller than S.
+void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) {
   constexpr double tetsPerSquare = 45;  // [choice] measured 36 to 55 per cube face of area of S
-  const double edge = std::max({M.cube.x, M.cube.y, M.cube.z});
-  const double halvings = std::max(0., std::ceil(std::log2(std::sqrt(3.) * edge / lc)));
-  const double h = edge / std::exp2(halvings);
-  double area = 0;
+  constexpr int maxLevel = 57;          // 2^19 cubes along a unit of ξ: what a lattice key holds
+  const int level = cubeLevel(M, lc);
+  const double halving = std::exp2(-level / 3);
+  const double h = halving * std::cbrt(M.cube.x * M.cube.y * M.cube.z);
+  double area = 0, farthest = 0, extent = 0;
   for (const auto& t : S.S.triangles)
     area += .5 * norm(cross(S.S.points[t[1]] - S.S.points[t[0]], S.S.points[t[2]] - S.S.points[t[0]]));
+  for (const Vec3& p : S.S.points) extent = std::max(extent, norm(p - S.S.points[S.rim[0]]));
+  for (const Vec3& xi : M.xi) farthest = std::max({farthest, xi.x, xi.y, xi.z});
+  if (extent < 2 * h)
+    throw InputError("insertSurface (§3.2): S, of extent " + number(extent) +
+                     ", is smaller than two cubes of edge " + number(h) + " that l_c = " + number(lc) +
+                     " gives; lower l_c to " + number(.5 * lc * extent / (2 * h)));
   const double predicted = static_cast<double>(M.tets.size()) + tetsPerSquare * area / (h * h);
   if (predicted > maxTets)
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " asks for about " +
                      number(predicted) + " tetrahedra, above the limit of " +
                      std::to_string(maxTets) + "; raise l_c or the limit");
-  constexpr double latticeSize = 1 << 19;  // cubes along an axis that a lattice key holds
-  for (const Vec3& xi : M.xi)
-    if (std::max({xi.x, xi.y, xi.z}) * std::exp2(halvings) > latticeSize)
-      throw InputError("insertSurface (§3.2): l_c = " + number(lc) +
-                       " is below 1/500000 of the domain; raise l_c");
+  if (level > maxLevel || farthest / halving > std::exp2(maxLevel / 3))
+    throw InputError("insertSurface (§3.2): l_c = " + number(lc) +
+                     " is below 1/500000 of the domain; raise l_c");
 }
 
 /// One way to insert S: a side, and how the outline of S_M is made.
@@ -3663,7 +3688,8 @@ void follow(const Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
 /// The measures of S_M that the report promises, and the warnings.
 void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertReport& report) {
   constexpr int samples = 4;
-  constexpr double poorHausdorff = .3, poorShift = 2;
+  constexpr double poorHausdorff = .3, badHausdorff = .5;  // [choice] of l_c: warned of, refused
+  constexpr double poorShift = 2;                          // [choice] of h: warned of
   const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
   std::vector<char> on(M.x.size(), 0);
   for (const auto& face : faces)
@@ -3675,6 +3701,10 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
     }
   report.triangles = static_cast<int>(faces.size());
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
+  if (report.hausdorff > badHausdorff * report.lc)
+    throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
+                      number(report.hausdorff) + ", above half of l_c: S has a part narrower than "
+                      "the cubes");
   if (report.hausdorff > poorHausdorff * report.lc)
     report.warnings.push_back("the Hausdorff distance S_M - S, " + number(report.hausdorff) +
                               ", is above .3 l_c; lower l_c");
@@ -3692,6 +3722,7 @@ void tryWay(const Insertion& I, const Way& way, double lc, Mesh& result, InsertR
   now.surface = I.k, now.lc = lc;
   try {
     follow(I, way, trial, now);
+    measureSurface(trial, I.S, I.Q.h, now);
   } catch (const Error& error) {
     faults.push_back(describe(way) + ": " + error.what());
     return;
@@ -3721,9 +3752,7 @@ bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions
     if (!isGood())
       for (const Way& way : extractWays(I, outline, faults))
         if (!isGood()) tryWay(I, way, lc, result, report, faults);
-  if (report.surface == 0) return false;
-  measureSurface(result, S, I.Q.h, report);
-  return true;
+  return report.surface > 0;
 }
 
 }  // namespace
@@ -3735,7 +3764,10 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
     throw InputError("insertSurface (§3.2): l_c = " + number(options.lc) + " must be above 0");
   InsertReport report;
   report.original = qualityStatistics(M);
-  const SurfaceDistance cleaned(checkSurface(S, report.warnings));
+  TriangleSurface disk = checkSurface(S, report.warnings);
+  splitChords(disk);
+  const SurfaceDistance cleaned(disk);
+  checkDistances(M, cleaned, options.lc);
   checkSize(M, cleaned, options.lc, options.maxTets);
 
   Mesh result;

@@ -398,6 +398,8 @@ bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& trian
 /// [§3.2] r^E: the longest edge of tetrahedron E, length unit of the input. [choice] measured on the
 /// undeformed cubes: on a smoothed mesh one stretched element would ask for a level too many.
 double longestEdge(const Mesh& M, int E);
+/// [§3.2, §3.3] The level of whole cubes at which no element has r^E >= l_c: a multiple of 3.
+int cubeLevel(const Mesh& M, double lc);
 /// [§3.2, eq. (1)] r^E >= l_c: the element is to be refined.
 bool isTooLarge(const Mesh& M, int E, double lc);
 
@@ -645,7 +647,8 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational)
 
 /// [§3] Inserts S into M: 3.2 approximation, 3.3 healing, 3.4 extraction, 3.5 surface healing,
 /// 3.6 projection, 3.7 optimization. Afterwards 0 elements are inverted and every node of S_M lies on S.
-///   errors  InputError: S, M or the options break §3.1; MethodError: a step cannot reach what it promises;
+///   errors  InputError: S, M or the options break §3.1 (see checkSurface), l_c is not below dist(∂M, S) or the
+///           distance to an earlier surface, too many tetrahedra; MethodError: a step cannot reach what it promises;
 ///           SolverError: a linear solve failed. M is unchanged when it throws.
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options);
 

@@ -1020,14 +1020,12 @@ bool untangleAndSmooth(Smoother& S) {
 constexpr double worstFraction = .01;   // of the elements count as the worst ones,
 constexpr std::size_t worstCount = 10;  // but at least so many
 constexpr int liftRounds = 15, liftSweeps = 8;
-constexpr double liftMeanLoss = .008;  // of mean q: the rounds end there,
+constexpr double liftMeanLoss = .015;  // of mean q: the rounds end there (the last one wins most back),
 constexpr double liftMinGain = .002;   // or where the lowest q rises by less
-constexpr double liftMaxDisp = 1e-3;
-constexpr double liftWake =
-    .05;  // unrest for a visit: only what happens near the worst elements counts
-constexpr double liftReach = .85;  // (η/η_w)^48 below it is nothing
-constexpr double liftRatio =
-    1.6;  // η/η_w at most: 1.6^48 = 6e9, and a Newton step lowers it e-fold
+constexpr double liftMaxDisp = 1e-3;   // relative to the shortest edge: a round's sweeps end there
+constexpr double liftWake = .05;       // unrest for a visit: only what happens near the worst counts
+constexpr double liftReach = .85;      // (η/η_w)^48 below it is nothing
+constexpr double liftRatio = 1.6;      // η/η_w at most: 1.6^48 = 6e9, and a Newton step lowers it e-fold
 
 std::vector<double> elementQualities(const Smoother& S) {
   std::vector<double> q;
@@ -1050,11 +1048,11 @@ WorstElements worstElements(std::vector<double> q) {
   return {*std::min_element(q.begin(), q.end()), sum / count, q[k]};
 }
 
-// One round: sweeps on Σ η + (η/η_w)^power from the nodes of the worst elements on.
-void liftRound(Smoother& S, const WorstElements& worst, double power) {
-  S.phi = powerPenalty(power);
+// One round: sweeps on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes of the worst elements on.
+void liftRound(Smoother& S, const WorstElements& worst, double qw) {
+  S.phi = powerPenalty(S.options.power);
   S.phi.linear = 1;
-  S.phi.scale = std::min(worst.bound, liftRatio * worst.lowest);  // 1/η_w
+  S.phi.scale = qw;
   S.wake = liftWake;
   for (std::size_t E = 0; E < S.M.tets.size(); ++E)
     if (elementQuality(S, static_cast<int>(E)) <= worst.bound / liftReach)
@@ -1067,18 +1065,20 @@ void liftRound(Smoother& S, const WorstElements& worst, double power) {
 }
 
 /// [§3.7.4 departure] Raises the worst elements of a valid, converged mesh: Σ η + (η/η_w)^power,
-/// with η_w the distortion that the worst 1 % exceed, anew in each round. The others keep Σ η. Ends
-/// where it would cost too much of the mean quality.
+/// with η_w the distortion that the worst 1 % exceed, anew in each round; the others keep Σ η. Ends
+/// where the lowest q rises no more. A last round with η_w that of the worst element lets all the
+/// others relax and wins the mean back.
 void liftWorst(Smoother& S) {
   WorstElements worst = worstElements(elementQualities(S));
   const double meanAtStart = worst.mean;
   for (int round = 0; round < liftRounds && sweepsLeft(S); ++round) {
     const double before = worst.lowest;
     if (before > 1 - liftMinGain) return;
-    liftRound(S, worst, S.options.power);
+    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest));
     worst = worstElements(elementQualities(S));
-    if (worst.mean < meanAtStart - liftMeanLoss || worst.lowest < before + liftMinGain) return;
+    if (worst.mean < meanAtStart - liftMeanLoss || worst.lowest < before + liftMinGain) break;
   }
+  liftRound(S, worst, worst.lowest);
 }
 
 // ---- input -------------------------------------------------------------------------------------

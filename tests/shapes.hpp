@@ -9,9 +9,12 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <map>
+#include <set>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "../meccano.hpp"
@@ -322,6 +325,119 @@ inline double diagonal(const TriangleSurface& S) {
     high = {std::max(high.x, p.x), std::max(high.y, p.y), std::max(high.z, p.z)};
   }
   return norm(high - low);
+}
+
+// ==== The steps of §3, and what a mesh looks like after them ======================================
+
+/// A mesh and a surface on their way through 3.2 to 3.5, step by step.
+struct Steps {
+  Mesh M;
+  meccano::SurfaceDistance S;
+  meccano::Bisection B;
+  meccano::Approximation A;
+  meccano::SquareSurface Q;
+
+  Steps(Mesh mesh, const TriangleSurface& surface)
+      : M(std::move(mesh)), S(cleaned(surface)), B(M), A(), Q() {}
+  Steps(const Steps&) = delete;
+  void approximate(double lc) { A = meccano::volumetricApproximation(B, S, lc); }
+  void heal() {
+    meccano::volumetricHealing(B, A);
+    Q = meccano::boundarySquares(M, A);
+  }
+  static TriangleSurface cleaned(const TriangleSurface& surface) {
+    std::vector<std::string> warnings;
+    return meccano::checkSurface(surface, warnings);
+  }
+};
+
+/// Whether two lists hold the same bytes.
+template <class T>
+bool sameBytes(const std::vector<T>& a, const std::vector<T>& b) {
+  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0);
+}
+
+/// Whether two meshes are the same, byte for byte.
+inline bool sameMesh(const Mesh& a, const Mesh& b) {
+  bool same = sameBytes(a.x, b.x) && sameBytes(a.xi, b.xi) && sameBytes(a.tets, b.tets) &&
+              sameBytes(a.type, b.type) && sameBytes(a.level, b.level) &&
+              sameBytes(a.faceLabel, b.faceLabel) && sameBytes(a.dimension, b.dimension) &&
+              sameBytes(a.entity, b.entity) && sameBytes(a.parameter, b.parameter) &&
+              a.cube == b.cube && a.surfaces.size() == b.surfaces.size() &&
+              a.patches.size() == b.patches.size() && a.curves.size() == b.curves.size() &&
+              a.corners.size() == b.corners.size();
+  if (!same) return false;
+  auto sameSurface = [](const meccano::Parametrization& p, const meccano::Parametrization& q) {
+    return sameBytes(p.points, q.points) && sameBytes(p.triangles, q.triangles) &&
+           sameBytes(p.u, q.u) && p.name == q.name && p.rim == q.rim && p.gridSize == q.gridSize &&
+           sameBytes(p.gridStart, q.gridStart) && sameBytes(p.gridTriangles, q.gridTriangles);
+  };
+  for (std::size_t i = 0; i < a.surfaces.size(); ++i)
+    same = same && sameSurface(a.surfaces[i], b.surfaces[i]);
+  for (std::size_t i = 0; i < a.patches.size(); ++i)
+    same = same && sameSurface(a.patches[i], b.patches[i]);
+  for (std::size_t i = 0; i < a.curves.size(); ++i) {
+    const meccano::Curve &c = a.curves[i], &d = b.curves[i];
+    same = same && sameBytes(c.points, d.points) && sameBytes(c.s, d.s) && c.closed == d.closed &&
+           c.sides.size() == d.sides.size();
+    for (std::size_t j = 0; same && j < c.sides.size(); ++j)
+      same = c.sides[j].surface == d.sides[j].surface && sameBytes(c.sides[j].u, d.sides[j].u);
+  }
+  for (std::size_t i = 0; i < a.corners.size(); ++i) {
+    const meccano::Corner &c = a.corners[i], &d = b.corners[i];
+    same = same && c.x == d.x && c.on.size() == d.on.size();
+    for (std::size_t j = 0; same && j < c.on.size(); ++j)
+      same = c.on[j].curve == d.on[j].curve && c.on[j].s == d.on[j].s;
+  }
+  return same;
+}
+
+/// Labels, from both sides, each face for whose computational corners `wanted` holds.
+template <class Wanted>
+void labelFaces(Mesh& M, int k, Wanted wanted) {
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      const Face f = faceOf(M.tets[E], i);
+      if (wanted(M.xi[f[0]], M.xi[f[1]], M.xi[f[2]])) M.faceLabel[E][i] = k;
+    }
+}
+
+/// Whether a face lies in the box [low, high] of the computational space (a square: one side is 0).
+inline bool facesInBox(Vec3 a, Vec3 b, Vec3 c, Vec3 low, Vec3 high) {
+  for (Vec3 p : {a, b, c})
+    if (p.x < low.x || p.x > high.x || p.y < low.y || p.y > high.y || p.z < low.z || p.z > high.z)
+      return false;
+  return true;
+}
+
+/// S_M as sets, counted from its faces: edges with their number of faces; nodes, 2 on the rim, else 1.
+struct SurfaceSets {
+  std::set<Face> faces;
+  std::map<Edge, int> edges;
+  std::map<int, int> nodes;
+  SurfaceSets(const Mesh& M, int k) : faces(), edges(), nodes() {
+    for (const Face& f : meccano::surfaceFaces(M, k)) {
+      faces.insert(sortedFace(f[0], f[1], f[2]));
+      for (int i = 0; i < 3; ++i) {
+        ++edges[sortedEdge(f[i], f[(i + 1) % 3])];
+        nodes[f[i]] = 1;
+      }
+    }
+    for (const auto& [edge, count] : edges)
+      if (count == 1) nodes[edge[0]] = nodes[edge[1]] = 2;
+  }
+  bool isRimEdge(int a, int b) const {
+    const auto at = edges.find(sortedEdge(a, b));
+    return at != edges.end() && at->second == 1;
+  }
+};
+
+/// Area of the faces labelled k in the computational space.
+inline double computationalArea(const Mesh& M, int k) {
+  double area = 0;
+  for (const Face& f : meccano::surfaceFaces(M, k))
+    area += .5 * norm(cross(M.xi[f[1]] - M.xi[f[0]], M.xi[f[2]] - M.xi[f[0]]));
+  return area;
 }
 
 }  // namespace shapes

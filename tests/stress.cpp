@@ -74,7 +74,7 @@ Result runCase(const Case& c, const Settings& settings) {
   InsertOptions options = c.paper ? InsertOptions::paper() : InsertOptions{};
   options.lc = c.lc;
   if (settings.power > 0) options.optimize.power = settings.power;
-  if (settings.whole) options.halfSquares = false;
+  if (settings.whole) options.outline = Outline::squares;
   const auto start = std::chrono::steady_clock::now();
   auto elapsed = [&] {
     return std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();

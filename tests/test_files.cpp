@@ -525,7 +525,7 @@ TEST_SUITE("command line") {
     const std::string S = folder.file("sine.obj", sineObj(24));
     REQUIRE(call({"box", "-o", box, "--cells", "2", "2", "2"}).status == 0);
     const std::string prefix = folder / "stage";
-    const Outcome o = call({"insert", box, S, "-o", out, "--lc", ".2", "--stages", prefix}, true);
+    const Outcome o = call({"insert", box, S, "-o", out, "--lc", ".12", "--stages", prefix}, true);
     REQUIRE_MESSAGE(o.status == 0, o.err);
     for (const char* word : {"Table I", "original", "refined", "projected", "smoothed", "inverted",
                              "std dev", "regular tetrahedron", "surface 1 (sine)", "Hausdorff"})
@@ -552,7 +552,7 @@ TEST_SUITE("command line") {
         CHECK(cross(b - a, c - a).z > 0);
       }
     CHECK(has(call({"stats", out}).out, "surface 1 (sine)"));
-    const Outcome quiet = call({"insert", box, S, "-o", out, "--lc", ".2", "--quiet"}, true);
+    const Outcome quiet = call({"insert", box, S, "-o", out, "--lc", ".12", "--quiet"}, true);
     CHECK(quiet.err == "");
     CHECK(readFile(out) == text);
   }
