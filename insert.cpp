@@ -445,9 +445,6 @@ int Bisection::tetWithEdge(int a, int b) const {
   return -1;
 }
 
-namespace {
-
-/// u of node n on the surface with this label: its own, or that of its curve or corner there.
 bool parameterOn(const Mesh& M, int n, int label, Vec2& u) {
   if (M.dimension[n] == 2 && M.entity[n] == label) {
     u = M.parameter[n];
@@ -468,6 +465,8 @@ bool parameterOn(const Mesh& M, int n, int label, Vec2& u) {
       if (onCurve(place.curve, place.s)) return true;
   return false;
 }
+
+namespace {
 
 /// s of node n on curve c.
 bool parameterOnCurve(const Mesh& M, int n, int c, double& s) {
@@ -3656,6 +3655,28 @@ std::vector<int> nodesNear(const Mesh& M, int k) {
   return nodes;
 }
 
+/// §3.7, and [departure] where a few elements stay inverted: they are bisected for more freedom, as long
+/// as their number falls. No global descent here: other ways of inserting S are cheaper.
+void optimizeAround(Bisection& B, const Insertion& I, InsertReport& report) {
+  constexpr int maxRounds = 4, fewInverted = 60;
+  OptimizeOptions optimize = I.options.optimize;
+  optimize.globalDescent = false;
+  optimize.active = nodesNear(B.M, I.k);
+  report.optimization = optimizeMesh(B.M, optimize);
+  for (int round = 0; round < maxRounds; ++round) {
+    const int inverted = report.optimization.inverted;
+    if (inverted == 0 || inverted > fewInverted) return;
+    const std::vector<double> q = qualities(B.M);
+    for (std::size_t E = 0; E < q.size(); ++E)
+      if (q[E] <= 0) B.bisect(static_cast<int>(E));
+    surfaceHealing(B, I.k);
+    const int sweeps = report.optimization.sweeps;
+    report.optimization = optimizeMesh(B.M, optimize);
+    report.optimization.sweeps += sweeps;
+    if (report.optimization.inverted >= inverted) return;
+  }
+}
+
 /// §3.4's labels, 3.5, 3.6 and 3.7 on a copy of the refined mesh.
 void follow(const Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   Bisection B(M);
@@ -3673,9 +3694,7 @@ void follow(const Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   report.projected = qualityStatistics(M);
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
-  OptimizeOptions optimize = I.options.optimize;
-  optimize.active = nodesNear(M, I.k);
-  report.optimization = optimizeMesh(M, optimize);
+  optimizeAround(B, I, report);
   report.smoothed = qualityStatistics(M);
   I.progress("3.7 optimization: " + std::to_string(report.optimization.sweeps) + " sweeps, " +
              std::to_string(report.smoothed.inverted) + " inverted, min " +

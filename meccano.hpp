@@ -163,6 +163,8 @@ struct OptimizeOptions {
   // [§3.7.4 departure] Once valid and converged, the worst 1 % of the elements are lifted by Σ η + (η/η_w)^power.
   double power = 48;       // [1, 64], 1: none
   bool numericalDerivatives = false;  // §3.7.3: derivatives in u and s by differences, as printed
+  int maxTangledSweeps = 60;  // most meshes are valid after 20; then [departure] the global descent, if wanted
+  bool globalDescent = true;  // [departure] all nodes at once, for states that no single node can leave
   double mu = 8e-3;        // h(σ_min) that δ gives, relative to the mean σ; (0, 1)
   double relaxation = 1.6; // [§3.7.4 departure] first trial step, in Newton steps; [1, 2), 1: as printed
   std::vector<int> fixed = {};   // nodes that stay where they are, besides the corners
@@ -264,6 +266,9 @@ Location locate(const Parametrization& P, Vec2 u);
 /// [§3.6, eq. (3)] ϕ(u): affine on each triangle of 𝓤; errors: MethodError where u is outside.
 Vec3 varphi(const Parametrization& P, Vec2 u);
 Vec3 varphi(const Parametrization& P, const Location& at);
+
+/// u of node n on the surface with this label: its own, or that of its curve or corner there. False: not on it.
+bool parameterOn(const Mesh& M, int n, int label, Vec2& u);
 
 /// The surface or patch with a label as in Mesh::faceLabel.
 const Parametrization& surfaceOf(const Mesh& M, int label);

@@ -962,7 +962,6 @@ void globalDescent(Smoother& S) {
 // ---- Algorithm 2 -------------------------------------------------------------------------------
 
 constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is not visited again
-constexpr int sweepsToGlobalDescent = 60;      // most meshes are valid after 20
 constexpr int sweepsWithoutProgress = 3;       // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
@@ -997,7 +996,8 @@ bool untangleAndSmooth(Smoother& S) {
     if (tangled) {
       const Validity v = validity(S);
       tangled = v.inverted > 0;
-      if (tangled && schedule.tangledSweeps >= sweepsToGlobalDescent) {
+      if (tangled && schedule.tangledSweeps >= S.options.maxTangledSweeps) {
+        if (!S.options.globalDescent) return false;
         S.M.x = initialX;  // sweeps may have tangled it more
         S.M.parameter = initialParameter;
         globalDescent(S);
@@ -1090,6 +1090,8 @@ void liftWorst(Smoother& S) {
 void checkOptions(const OptimizeOptions& o, std::size_t nodes) {
   const auto number = [](double x) { return std::to_string(x); };
   if (!(o.maxDisp > 0)) refuse("maxDisp = " + number(o.maxDisp) + " must be > 0");
+  if (o.maxTangledSweeps < 1)
+    refuse("maxTangledSweeps = " + std::to_string(o.maxTangledSweeps) + " must be >= 1");
   if (o.maxSweeps < 1) refuse("maxSweeps = " + std::to_string(o.maxSweeps) + " must be >= 1");
   if (!(o.power >= 1 && o.power <= 64))
     refuse("power = " + number(o.power) + " must be in [1, 64]");
