@@ -3612,6 +3612,7 @@ struct Insertion {
   Approximation A;
   SquareSurface Q;
   int k;               // number of the new surface
+  int& ways;           // tried so far, over all l_c
 
   void stage(const char* name, const Mesh& mesh) const {
     if (options.onStage) options.onStage(name, mesh);
@@ -3655,8 +3656,18 @@ std::vector<int> nodesNear(const Mesh& M, int k) {
   return nodes;
 }
 
-/// §3.7, and [departure] where a few elements stay inverted: they are bisected for more freedom, as long
-/// as their number falls. No global descent here: other ways of inserting S are cheaper.
+/// Lets a node fixed at a sharp corner of S slide along the rim.
+void releaseCorner(Mesh& M, int n, int k) {
+  if (M.dimension[n] != 0) return;
+  for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
+    if (place.curve == M.surfaces[k - 1].rim) {
+      M.dimension[n] = 1, M.entity[n] = place.curve, M.parameter[n] = {place.s, 0};
+      return;
+    }
+}
+
+/// §3.7, and [departure] where a few elements stay inverted: their corners are released, they are bisected
+/// for more freedom, as long as their number falls. No global descent here: other ways of inserting S are cheaper.
 void optimizeAround(Bisection& B, const Insertion& I, InsertReport& report) {
   constexpr int maxRounds = 4, fewInverted = 60;
   OptimizeOptions optimize = I.options.optimize;
@@ -3668,7 +3679,10 @@ void optimizeAround(Bisection& B, const Insertion& I, InsertReport& report) {
     if (inverted == 0 || inverted > fewInverted) return;
     const std::vector<double> q = qualities(B.M);
     for (std::size_t E = 0; E < q.size(); ++E)
-      if (q[E] <= 0) B.bisect(static_cast<int>(E));
+      if (q[E] <= 0) {
+        for (int n : B.M.tets[E]) releaseCorner(B.M, n, I.k);
+        B.bisect(static_cast<int>(E));
+      }
     surfaceHealing(B, I.k);
     const int sweeps = report.optimization.sweeps;
     report.optimization = optimizeMesh(B.M, optimize);
@@ -3733,10 +3747,11 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
 }
 
 /// Follows one way; keeps its mesh and report where it is the best valid one so far.
-void tryWay(const Insertion& I, const Way& way, double lc, Mesh& result, InsertReport& report,
+void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport& report,
             std::vector<std::string>& faults) {
   Mesh trial = I.M;
   InsertReport now;
+  now.way = ++I.ways;
   now.original = report.original, now.warnings = report.warnings;
   now.surface = I.k, now.lc = lc;
   try {
@@ -3752,9 +3767,10 @@ void tryWay(const Insertion& I, const Way& way, double lc, Mesh& result, InsertR
 
 /// One l_c: 3.2 to 3.7 on all ways until one is good; the best valid one. False where none is valid.
 bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions& options, double lc,
-                    Mesh& result, InsertReport& report, std::vector<std::string>& faults) {
+                    int& ways, Mesh& result, InsertReport& report,
+                    std::vector<std::string>& faults) {
   constexpr double goodQuality = .45;  // [choice] below it the other ways are tried too
-  Insertion I{S, options, M, {}, {}, static_cast<int>(M.surfaces.size()) + 1};
+  Insertion I{S, options, M, {}, {}, static_cast<int>(M.surfaces.size()) + 1, ways};
   Bisection B(I.M);
   I.A = volumetricApproximation(B, S, lc);
   I.stage("refined", I.M);
@@ -3792,11 +3808,12 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
   Mesh result;
   std::vector<std::string> faults;
   double lc = options.lc;
+  int ways = 0;
   for (int halving = 0; halving <= maxHalvings; ++halving, lc /= 2) {
     if (halving > 0) checkSize(M, cleaned, lc, options.maxTets);
     bool valid = false;
     try {
-      valid = insertWithSize(M, cleaned, options, lc, result, report, faults);
+      valid = insertWithSize(M, cleaned, options, lc, ways, result, report, faults);
     } catch (const MethodError& error) {
       faults.push_back(error.what());
     }

@@ -22,7 +22,6 @@
 #include <map>
 #include <memory>
 #include <new>
-#include <numeric>
 #include <string_view>
 
 namespace meccano::app {
@@ -321,72 +320,7 @@ TriangleSurface parseObj(const std::string& name, const std::string& text) {
   return S;
 }
 
-/// Gives points that coincide exactly one number; returns how many went.
-int weld(TriangleSurface& S) {
-  std::vector<int> order(S.points.size()), number(S.points.size());
-  std::iota(order.begin(), order.end(), 0);
-  auto key = [&](int i) {
-    return std::array<double, 3>{S.points[i].x, S.points[i].y, S.points[i].z};
-  };
-  std::sort(order.begin(), order.end(), [&](int a, int b) {
-    return key(a) != key(b) ? key(a) < key(b) : a < b;
-  });
-  int gone = 0;
-  for (std::size_t i = 0; i < order.size(); ++i) {
-    const bool again = i > 0 && S.points[order[i]] == S.points[order[i - 1]];
-    number[order[i]] = again ? number[order[i - 1]] : order[i];
-    gone += again;
-  }
-  for (std::array<int, 3>& t : S.triangles)
-    for (int& n : t) n = number[n];
-  return gone;
-}
-
-/// Drops triangles of no area and those that are there twice; returns how many went.
-int dropTriangles(TriangleSurface& S) {
-  std::map<std::array<int, 3>, int> seen;
-  std::vector<std::array<int, 3>> kept;
-  for (const std::array<int, 3>& t : S.triangles) {
-    std::array<int, 3> key = t;
-    std::sort(key.begin(), key.end());
-    const Vec3 a = S.points[t[0]], b = S.points[t[1]], c = S.points[t[2]];
-    const bool flat = key[0] == key[1] || key[1] == key[2] || norm2(cross(b - a, c - a)) == 0;
-    if (!flat && seen[key]++ == 0) kept.push_back(t);
-  }
-  const int gone = static_cast<int>(S.triangles.size() - kept.size());
-  S.triangles = kept;
-  return gone;
-}
-
-/// Removes the points no triangle uses.
-void dropPoints(TriangleSurface& S) {
-  std::vector<int> number(S.points.size(), -1);
-  for (const std::array<int, 3>& t : S.triangles)
-    for (int n : t) number[n] = 0;
-  std::vector<Vec3> kept;
-  for (std::size_t i = 0; i < number.size(); ++i)
-    if (number[i] == 0) {
-      number[i] = static_cast<int>(kept.size());
-      kept.push_back(S.points[i]);
-    }
-  for (std::array<int, 3>& t : S.triangles)
-    for (int& n : t) n = number[n];
-  S.points = kept;
-}
-
-/// Reads and cleans a surface; what was cleaned away is added to the warnings.
-TriangleSurface readSurface(const std::string& path, std::vector<std::string>& warnings) {
-  TriangleSurface S = parseObj(path, readFile(path));
-  const int welded = weld(S), dropped = dropTriangles(S);
-  dropPoints(S);
-  if (welded)
-    warnings.push_back(path + ": " + std::to_string(welded) + " coinciding points welded");
-  if (dropped)
-    warnings.push_back(path + ": " + std::to_string(dropped) +
-                       " duplicate or flat triangles dropped");
-  if (S.triangles.empty()) fail(path + ": no triangle is left without the duplicate and flat ones");
-  return S;
-}
+TriangleSurface readSurface(const std::string& path) { return parseObj(path, readFile(path)); }
 
 // ==== VTK legacy: the arrays ====================================================================
 
@@ -1263,6 +1197,28 @@ InsertOptions insertOptions(const Arguments& a) {
   return o;
 }
 
+/// The files of --stages PREFIX. Stages come once for each way of inserting that is tried; those of the
+/// way that was taken are written.
+struct Stages {
+  std::string prefix;  // empty: none are kept
+  int way = 0;
+  std::vector<std::pair<int, Output>> kept;  // with the way, 0: all
+
+  void keep(const char* name, const Mesh& M, int ofWay) {
+    if (!prefix.empty()) kept.push_back({ofWay, {prefix + "-" + name + ".vtk", vtkText(M)}});
+  }
+  void see(const std::string& stage, const Mesh& M) {
+    way += stage == "extracted";
+    if (stage == "surfaceHealed") keep("refined", M, way);  // Figure 8b: S_M is extracted
+    if (stage == "projected") keep("projected", M, way);
+    if (stage == "smoothed") keep("smoothed", M, 0);
+  }
+  void take(int ofWay, std::vector<Output>& outputs) const {
+    for (const auto& [w, output] : kept)
+      if (w == 0 || w == ofWay) outputs.push_back(output);
+  }
+};
+
 void runInsert(const Arguments& a, const Streams& io) {
   const std::string path = a.output();
   if (!a.has("--lc")) throw UsageError("the size is missing: --lc L");
@@ -1275,23 +1231,19 @@ void runInsert(const Arguments& a, const Streams& io) {
   if (!prefix.empty()) checkWritable(prefix + "-original.vtk");
   Mesh M = readMesh(a.operands[0]);
   checkInsertable(a.operands[0], M);
-  std::vector<std::string> warnings;
-  const TriangleSurface S = readSurface(a.operands[1], warnings);
+  const TriangleSurface S = readSurface(a.operands[1]);
   Progress progress(io, a.has("--quiet"));
-  for (const std::string& w : warnings) progress.warning(w);
   progress.line("mesh " + a.operands[0] + ": " + sizeOf(M));
   progress.line("surface " + a.operands[1] + ": " + std::to_string(S.points.size()) + " points, " +
                 std::to_string(S.triangles.size()) + " triangles");
-  std::vector<Output> outputs;
-  auto keepStage = [&](const char* stage, const Mesh& mesh) {
-    if (!prefix.empty()) outputs.push_back({prefix + "-" + stage + ".vtk", vtkText(mesh)});
-  };
-  keepStage("original", M);
-  options.onStage = keepStage;
+  Stages stages{prefix, 0, {}};
+  stages.keep("original", M, 0);
+  options.onStage = [&](const char* stage, const Mesh& mesh) { stages.see(stage, mesh); };
   options.onProgress = [&](const std::string& line) { progress.line(line); };
   options.optimize.onSweep = [&](const Sweep& s) { progress.sweep(s); };
   const InsertReport report = insertSurface(M, S, options);
-  outputs.push_back({path, vtkText(M)});
+  std::vector<Output> outputs{{path, vtkText(M)}};
+  stages.take(report.way, outputs);
   writeFiles(outputs);
   for (const std::string& w : report.warnings) progress.warning(w);
   progress.line(path + ": " + sizeOf(M));
@@ -1365,7 +1317,7 @@ struct Command {
 constexpr Option outputOption{"-o", "OUT.vtk", "the mesh to write"};
 constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
 constexpr Option powerOption{"--power", "P",
-                             "exponent of the last sweeps, for the worst elements (default 6)"};
+                             "exponent of the term that lifts the worst elements (default 48; 1: none)"};
 constexpr Option quietOption{"--quiet", "", "no progress on standard error"};
 
 const std::vector<Command>& commands() {

@@ -192,7 +192,8 @@ struct InsertOptions {
   bool followRim = true;      // [§3.6 departure] rim correspondence and anchored equations
   int maxTets = 20000000;     // refuse where more tetrahedra are predicted
   OptimizeOptions optimize;   // §3.7
-  // Called after each stage ("refined", "projected", "smoothed") with the mesh as it is then.
+  // Called after each stage with the mesh as it is then: "refined" (3.2), "healed" (3.3), for each way that is
+  // tried "extracted" (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the end "smoothed" (3.7).
   std::function<void(const char* stage, const Mesh&)> onStage = nullptr;
   std::function<void(const std::string& line)> onProgress = nullptr;  // a line per step
 
@@ -202,6 +203,7 @@ struct InsertOptions {
 struct InsertReport {
   int surface = 0;             // its number k: M.surfaces[k-1], faces labelled k
   double lc = 0;               // as used
+  int way = 0;                 // which of the tried ways (sides, outlines) was taken, from 1
   int nodes = 0, triangles = 0;// of S_M
   double maxNodeDistance = 0;  // largest |x_i - S| of the nodes of S_M
   double hausdorff = 0;        // two-sided, S_M - S, sampled

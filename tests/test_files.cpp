@@ -173,21 +173,6 @@ TEST_SUITE("files") {
     }
   }
 
-  TEST_CASE("OBJ: points are welded, duplicate and flat triangles dropped, and counted") {
-    Folder folder;
-    std::vector<std::string> warnings;
-    const TriangleSurface S = readSurface(
-        folder.file("s.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 0 -0\nv 0 1 0\nv 1 1 0\nv 9 9 9\n"
-                             "v 2 0 0\nf 1 2 3\nf 4 6 5\nf 3 1 2\nf 1 2 4\nf 1 2 8\n"), warnings);
-    CHECK(S.points.size() == 4);
-    CHECK(S.triangles.size() == 2);
-    REQUIRE(warnings.size() == 2);
-    CHECK(has(warnings[0], "2 coinciding points"));
-    CHECK(has(warnings[1], "3 duplicate or flat triangles"));
-    const std::string flat = folder.file("flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n");
-    CHECK(has(messageOf([&] { readSurface(flat, warnings); }), "no triangle is left"));
-  }
-
   TEST_CASE("files: missing ones and folders are named") {
     Folder folder;
     CHECK(has(messageOf([&] { readFile(folder / "none.obj"); }), "none.obj: cannot be read"));
