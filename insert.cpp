@@ -7,10 +7,10 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <limits>
+#include <cstdio>
+#include <map>
 #include <numeric>
 #include <set>
-#include <queue>
 
 namespace meccano {
 
@@ -664,9 +664,8 @@ void bisect(Mesh& M, const std::vector<int>& E) {
 
 namespace {
 
-/// Relative height (height / longest edge) at and below which a triangle counts as one of zero
-/// area: rounding of coordinates moves corners by about 1e-16 of their size, so a smaller height
-/// says nothing.
+/// Height over longest edge at and below which a triangle has zero area: coordinates are rounded by
+/// 1e-16 of their size, so a smaller height says nothing.
 constexpr double zeroHeight = 1e-14;
 
 std::string placeText(Vec3 p) {
@@ -675,12 +674,12 @@ std::string placeText(Vec3 p) {
   return text;
 }
 
-[[noreturn]] void refuseSurface(const std::string& what) {
-  throw InputError("insertSurface (§3.1): " + what);
+std::string counted(std::size_t n, const std::string& one) {
+  return std::to_string(n) + ' ' + one + (n == 1 ? "" : "s");
 }
 
-std::string counted(int n, const char* one, const char* many) {
-  return std::to_string(n) + ' ' + (n == 1 ? one : many);
+[[noreturn]] void refuseSurface(const std::string& what) {
+  throw InputError("insertSurface (§3.1): " + what);
 }
 
 /// Refuses indices out of range and coordinates that are not finite.
@@ -690,267 +689,210 @@ void checkNumbers(const TriangleSurface& S) {
     if (!isFinite(S.points[n]))
       refuseSurface("point " + std::to_string(n) + " has the coordinates " +
                     placeText(S.points[n]) + "; all coordinates must be finite numbers");
-  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t)
+  for (std::size_t t = 0; t < S.triangles.size(); ++t)
     for (int n : S.triangles[t])
       if (n < 0 || n >= points)
         refuseSurface("triangle " + std::to_string(t) + " names point " + std::to_string(n) +
-                      ", but there are " + counted(points, "point", "points") +
+                      ", but there are " + counted(points, "point") +
                       " (counted from 0); correct the index");
 }
 
-/// For each point the first one with exactly the same coordinates.
-std::vector<int> firstCoincident(const std::vector<Vec3>& points) {
-  std::vector<int> order(points.size()), first(points.size());
-  for (int n = 0; n < static_cast<int>(order.size()); ++n) order[n] = n;
-  std::sort(order.begin(), order.end(), [&](int a, int b) {
-    const Vec3 &p = points[a], &q = points[b];
-    if (p.x != q.x) return p.x < q.x;
-    if (p.y != q.y) return p.y < q.y;
-    return p.z != q.z ? p.z < q.z : a < b;
-  });
-  for (int i = 0; i < static_cast<int>(order.size()); ++i)
-    first[order[i]] =
-        i > 0 && points[order[i]] == points[order[i - 1]] ? first[order[i - 1]] : order[i];
-  return first;
-}
-
 bool hasZeroArea(Vec3 a, Vec3 b, Vec3 c) {
-  double longest2 = std::max({norm2(b - a), norm2(c - b), norm2(a - c)});
+  const double longest2 = std::max({norm2(b - a), norm2(c - b), norm2(a - c)});
   return norm(cross(b - a, c - a)) <= zeroHeight * longest2;
 }
 
-/// A surface while it is cleaned: `origin` is the number of each triangle in the user's data.
+/// A surface while it is cleaned, and the number of each of its triangles in the user's data.
 struct CleanSurface {
   TriangleSurface S;
   std::vector<int> origin;
 };
 
-/// Welds points, drops duplicate and zero-area triangles, then the points nobody uses.
+/// Welds coincident points, drops duplicate and zero-area triangles, then the points nobody uses.
 CleanSurface weldAndDrop(const TriangleSurface& S, std::vector<std::string>& warnings) {
-  std::vector<int> first = firstCoincident(S.points);
-  CleanSurface C;
-  C.S.name = S.name;
-  int duplicates = 0, flat = 0, unused = 0;
+  const int points = static_cast<int>(S.points.size());
+  std::map<std::array<double, 3>, int> atPlace;
+  std::vector<int> first(points), number(points, -1);  // first point at the place; number in C
+  for (int n = 0; n < points; ++n) {
+    const Vec3 p = S.points[n];
+    first[n] = atPlace.insert({{p.x, p.y, p.z}, n}).first->second;
+  }
+  CleanSurface C{{{}, {}, S.name}, {}};
   std::set<std::array<int, 3>> seen;
-  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
+  int duplicates = 0, flat = 0;
+  for (std::size_t t = 0; t < S.triangles.size(); ++t) {
     std::array<int, 3> v = S.triangles[t];
     for (int& n : v) n = first[n];
     std::array<int, 3> key = v;
     std::sort(key.begin(), key.end());
-    if (hasZeroArea(S.points[v[0]], S.points[v[1]], S.points[v[2]])) ++flat;
-    else if (!seen.insert(key).second) ++duplicates;
-    else {
+    if (hasZeroArea(S.points[v[0]], S.points[v[1]], S.points[v[2]])) {
+      ++flat;
+    } else if (!seen.insert(key).second) {
+      ++duplicates;
+    } else {
+      for (int n : v) number[n] = 0;
       C.S.triangles.push_back(v);
-      C.origin.push_back(t);
+      C.origin.push_back(static_cast<int>(t));
     }
   }
-  std::vector<int> number(S.points.size(), -1);
-  for (const std::array<int, 3>& v : C.S.triangles)
-    for (int n : v) number[n] = 0;
-  for (int n = 0; n < static_cast<int>(number.size()); ++n) {
-    if (number[n] == 0) {
-      number[n] = static_cast<int>(C.S.points.size());
-      C.S.points.push_back(S.points[n]);
-    } else if (first[n] == n) ++unused;
+  for (int n = 0; n < points; ++n) {
+    if (number[n] < 0) continue;
+    number[n] = static_cast<int>(C.S.points.size());
+    C.S.points.push_back(S.points[n]);
   }
   for (std::array<int, 3>& v : C.S.triangles)
     for (int& n : v) n = number[n];
+  const std::size_t unused = atPlace.size() - C.S.points.size();
   if (duplicates + flat + unused > 0)
-    warnings.push_back("§3.1: dropped " +
-                       counted(duplicates, "duplicate triangle", "duplicate triangles") + ", " +
-                       counted(flat, "zero-area triangle", "zero-area triangles") + " and " +
-                       counted(unused, "unused point", "unused points"));
+    warnings.push_back("§3.1: dropped " + counted(duplicates, "duplicate triangle") + ", " +
+                       counted(flat, "zero-area triangle") + " and " +
+                       counted(unused, "unused point"));
   return C;
 }
 
-/// One triangle's use of an edge: edge i of triangle t, from vertex i to vertex i + 1.
-struct EdgeUse {
-  int a, b, t, i;
+/// Disjoint sets of 0 .. n - 1, each named after its lowest member.
+struct Parts {
+  std::vector<int> parent;
+  explicit Parts(std::size_t n) : parent(n) { std::iota(parent.begin(), parent.end(), 0); }
+  int of(int i) {
+    while (parent[i] != i) i = parent[i] = parent[parent[i]];
+    return i;
+  }
+  void join(int i, int j) {
+    i = of(i);
+    j = of(j);
+    parent[std::max(i, j)] = std::min(i, j);
+  }
 };
 
-/// All uses of edges, those of one edge side by side (a < b; then by triangle).
-std::vector<EdgeUse> sortedEdgeUses(const std::vector<std::array<int, 3>>& triangles) {
-  std::vector<EdgeUse> uses;
-  uses.reserve(3 * triangles.size());
+/// Corner of a triangle at point n: 0, 1, 2.
+int cornerAt(const std::array<int, 3>& triangle, int n) {
+  return static_cast<int>(std::find(triangle.begin(), triangle.end(), n) - triangle.begin());
+}
+
+/// Refuses points where two fans of triangles meet only there. Corners 3 t + i of triangles that
+/// share an edge belong to one fan.
+void checkFans(const CleanSurface& C, const std::vector<std::array<int, 3>>& neighbours) {
+  const std::vector<std::array<int, 3>>& triangles = C.S.triangles;
+  Parts fans(3 * triangles.size());
   for (int t = 0; t < static_cast<int>(triangles.size()); ++t)
     for (int i = 0; i < 3; ++i) {
-      int a = triangles[t][i], b = triangles[t][(i + 1) % 3];
-      uses.push_back({std::min(a, b), std::max(a, b), t, i});
+      const int s = neighbours[t][i];
+      if (s < 0) continue;
+      for (int j : {i, (i + 1) % 3})
+        fans.join(3 * t + j, 3 * s + cornerAt(triangles[s], triangles[t][j]));
     }
-  std::sort(uses.begin(), uses.end(), [](const EdgeUse& p, const EdgeUse& q) {
-    return std::tie(p.a, p.b, p.t, p.i) < std::tie(q.a, q.b, q.t, q.i);
-  });
-  return uses;
-}
-
-std::vector<std::array<int, 3>> neighboursNumbered(const TriangleSurface& S,
-                                                   const std::vector<int>& origin) {
-  std::vector<EdgeUse> uses = sortedEdgeUses(S.triangles);
-  std::vector<std::array<int, 3>> neighbours(S.triangles.size(), {-1, -1, -1});
-  for (size_t k = 0; k + 1 < uses.size(); ++k) {
-    if (uses[k].a != uses[k + 1].a || uses[k].b != uses[k + 1].b) continue;
-    if (k + 2 < uses.size() && uses[k].a == uses[k + 2].a && uses[k].b == uses[k + 2].b)
-      refuseSurface("the edge from " + placeText(S.points[uses[k].a]) + " to " +
-                    placeText(S.points[uses[k].b]) + " is non-manifold: triangles " +
-                    std::to_string(origin[uses[k].t]) + ", " +
-                    std::to_string(origin[uses[k + 1].t]) + " and " +
-                    std::to_string(origin[uses[k + 2].t]) +
-                    " share it; split the surface there into several");
-    neighbours[uses[k].t][uses[k].i] = uses[k + 1].t;
-    neighbours[uses[k + 1].t][uses[k + 1].i] = uses[k].t;
-  }
-  return neighbours;
-}
-
-int cornerOf(const std::array<int, 3>& triangle, int n) {
-  return triangle[0] == n ? 0 : triangle[1] == n ? 1 : triangle[2] == n ? 2 : -1;
-}
-
-/// The triangles at a point, reached from t by crossing edges at the point; marks them.
-void markFan(const TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours, int t,
-             int n, std::vector<std::array<char, 3>>& marked) {
-  std::vector<int> stack{t};
-  while (!stack.empty()) {
-    int s = stack.back(), c = cornerOf(S.triangles[s], n);
-    stack.pop_back();
-    if (marked[s][c]) continue;
-    marked[s][c] = 1;
-    for (int i : {c, (c + 2) % 3})
-      if (neighbours[s][i] >= 0) stack.push_back(neighbours[s][i]);
-  }
-}
-
-/// Refuses points where two fans of triangles meet only there.
-void checkFans(const CleanSurface& C, const std::vector<std::array<int, 3>>& neighbours) {
-  std::vector<std::array<char, 3>> marked(C.S.triangles.size(), {0, 0, 0});
   std::vector<int> fan(C.S.points.size(), -1);
-  for (int t = 0; t < static_cast<int>(C.S.triangles.size()); ++t)
-    for (int i = 0; i < 3; ++i) {
-      if (marked[t][i]) continue;
-      int n = C.S.triangles[t][i];
-      if (fan[n] >= 0)
-        refuseSurface("the point " + placeText(C.S.points[n]) + " is non-manifold: triangles " +
-                      std::to_string(C.origin[fan[n]]) + " and " + std::to_string(C.origin[t]) +
-                      " meet only there; separate or join the two parts");
-      fan[n] = t;
-      markFan(C.S, neighbours, t, n, marked);
-    }
+  for (int c = 0; c < static_cast<int>(3 * triangles.size()); ++c) {
+    const int n = triangles[c / 3][c % 3];
+    if (fan[n] < 0) fan[n] = fans.of(c);
+    if (fan[n] != fans.of(c))
+      refuseSurface("the point " + placeText(C.S.points[n]) + " is non-manifold: triangles " +
+                    std::to_string(C.origin[fan[n] / 3]) + " and " +
+                    std::to_string(C.origin[c / 3]) +
+                    " meet only there; separate or join the two parts");
+  }
 }
 
-/// The number of triangles of each edge-connected component.
+/// The number of triangles of each edge-connected component, descending.
 std::vector<int> componentSizes(const std::vector<std::array<int, 3>>& neighbours) {
-  std::vector<int> sizes;
-  std::vector<char> seen(neighbours.size(), 0);
-  for (int start = 0; start < static_cast<int>(neighbours.size()); ++start) {
-    if (seen[start]) continue;
-    std::vector<int> stack{start};
-    seen[start] = 1;
-    sizes.push_back(0);
-    while (!stack.empty()) {
-      int t = stack.back();
-      stack.pop_back();
-      ++sizes.back();
-      for (int s : neighbours[t])
-        if (s >= 0 && !seen[s]) {
-          seen[s] = 1;
-          stack.push_back(s);
-        }
-    }
-  }
+  Parts parts(neighbours.size());
+  for (int t = 0; t < static_cast<int>(neighbours.size()); ++t)
+    for (int s : neighbours[t])
+      if (s >= 0) parts.join(t, s);
+  std::vector<int> sizes(neighbours.size(), 0);
+  for (int t = 0; t < static_cast<int>(neighbours.size()); ++t) ++sizes[parts.of(t)];
+  std::sort(sizes.rbegin(), sizes.rend());
+  sizes.erase(std::find(sizes.begin(), sizes.end(), 0), sizes.end());
   return sizes;
 }
 
-/// The edge of triangle s that is edge i of triangle t, and whether both run along it in opposite
-/// directions.
-struct SharedEdge {
-  int edge;
-  bool opposite;
-};
-SharedEdge sharedEdge(const std::array<int, 3>& t, int i, const std::array<int, 3>& s) {
-  int a = t[i], b = t[(i + 1) % 3];
-  for (int j = 0; j < 3; ++j) {
-    if (s[j] == b && s[(j + 1) % 3] == a) return {j, true};
-    if (s[j] == a && s[(j + 1) % 3] == b) return {j, false};
-  }
-  return {-1, false};
-}
-
-/// Turns triangles until all agree, the minority if there is one; false at a Möbius band (then `at`
-/// is an edge). `turned` gets the number of turned triangles. S is connected.
-bool orientConsistently(TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours,
-                        int& turned, std::array<int, 2>& at) {
+/// Turns triangles until all agree, the minority if there is one; S is connected.
+///   returns how many were turned, or -1 at a Möbius band
+int orientConsistently(TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours) {
   const int N = static_cast<int>(S.triangles.size());
-  std::vector<signed char> turn(N, -1);
-  std::vector<int> queue{0};
+  std::vector<int> turn(N, -1), queue{0};
   turn[0] = 0;
-  for (size_t q = 0; q < queue.size(); ++q) {
-    int t = queue[q];
+  for (std::size_t q = 0; q < queue.size(); ++q) {
+    const int t = queue[q];
     for (int i = 0; i < 3; ++i) {
-      int s = neighbours[t][i];
+      const int s = neighbours[t][i];
       if (s < 0) continue;
-      bool agree = sharedEdge(S.triangles[t], i, S.triangles[s]).opposite;
-      signed char wanted = static_cast<signed char>(agree ? turn[t] : 1 - turn[t]);
-      at = {S.triangles[t][i], S.triangles[t][(i + 1) % 3]};
-      if (turn[s] < 0) {
-        turn[s] = wanted;
-        queue.push_back(s);
-      } else if (turn[s] != wanted) return false;
+      const int a = S.triangles[t][i], b = S.triangles[t][(i + 1) % 3];
+      const bool agree = S.triangles[s][(cornerAt(S.triangles[s], b) + 1) % 3] == a;
+      const int wanted = agree ? turn[t] : 1 - turn[t];
+      if (turn[s] < 0) queue.push_back(s);
+      if (turn[s] == 1 - wanted) return -1;
+      turn[s] = wanted;
     }
   }
-  int ones = static_cast<int>(std::count(turn.begin(), turn.end(), 1));
-  signed char minority = ones > N / 2 ? 0 : 1;
-  turned = std::min(ones, N - ones);
+  const int ones = static_cast<int>(std::count(turn.begin(), turn.end(), 1));
+  const int minority = ones > N / 2 ? 0 : 1;
   for (int t = 0; t < N; ++t)
     if (turn[t] == minority) std::swap(S.triangles[t][1], S.triangles[t][2]);
-  return true;
+  return std::min(ones, N - ones);
 }
 
 /// Refuses what is no disk: S is connected, manifold and oriented.
 void checkDisk(const TriangleSurface& S) {
-  std::vector<std::vector<int>> rims = rimLoops(S);
+  const std::vector<std::vector<int>> rims = rimLoops(S);
   if (rims.empty())
-    refuseSurface("the surface is closed (" +
-                  counted(static_cast<int>(S.triangles.size()), "triangle", "triangles") +
+    refuseSurface("the surface is closed (" + counted(S.triangles.size(), "triangle") +
                   ", no rim); cut it open or insert a part of it");
   if (rims.size() > 1) {
-    std::sort(rims.begin(), rims.end(), [](const std::vector<int>& a, const std::vector<int>& b) {
-      return a.size() != b.size() ? a.size() > b.size() : a < b;
-    });
+    const auto shortest = std::min_element(
+        rims.begin(), rims.end(), [](const auto& a, const auto& b) { return a.size() < b.size(); });
     refuseSurface("the surface has holes: " + std::to_string(rims.size()) +
-                  " rims, the shortest of " + std::to_string(rims.back().size()) + " edges at " +
-                  placeText(S.points[rims.back()[0]]) + "; fill the holes, one rim must remain");
+                  " rims, the shortest of " + std::to_string(shortest->size()) + " edges at " +
+                  placeText(S.points[shortest->front()]) + "; fill the holes, one rim must remain");
   }
-  int edges = static_cast<int>(3 * S.triangles.size() + rims[0].size()) / 2;
-  int chi = static_cast<int>(S.points.size()) - edges + static_cast<int>(S.triangles.size());
-  if (chi != 1)
-    refuseSurface("the surface has " + counted((1 - chi) / 2, "handle", "handles") +
-                  " (Euler characteristic " + std::to_string(chi) +
+  const int edges = static_cast<int>(3 * S.triangles.size() + rims[0].size()) / 2;
+  const int euler = static_cast<int>(S.points.size() + S.triangles.size()) - edges;
+  if (euler != 1)
+    refuseSurface("the surface has " + counted((1 - euler) / 2, "handle") +
+                  " (Euler characteristic " + std::to_string(euler) +
                   ", a disk has 1); cut it into disks");
 }
 
 }  // namespace
 
-std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S) {
-  std::vector<int> origin(S.triangles.size());
-  for (int t = 0; t < static_cast<int>(origin.size()); ++t) origin[t] = t;
-  return neighboursNumbered(S, origin);
+std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S,
+                                                   const std::vector<int>& number) {
+  std::vector<std::pair<std::uint64_t, int>> uses;  // edge, 3 t + i of the triangle that uses it
+  for (int c = 0; c < static_cast<int>(3 * S.triangles.size()); ++c) {
+    const std::array<int, 3>& v = S.triangles[c / 3];
+    uses.push_back({edgeKey(v[c % 3], v[(c + 1) % 3]), c});
+  }
+  std::sort(uses.begin(), uses.end());
+  auto name = [&](int c) { return std::to_string(number.empty() ? c / 3 : number[c / 3]); };
+  std::vector<std::array<int, 3>> neighbours(S.triangles.size(), {-1, -1, -1});
+  for (std::size_t k = 0; k + 1 < uses.size(); ++k) {
+    if (uses[k].first != uses[k + 1].first) continue;
+    const int c = uses[k].second, d = uses[k + 1].second;
+    if (k + 2 < uses.size() && uses[k].first == uses[k + 2].first)
+      refuseSurface("the edge from " + placeText(S.points[uses[k].first >> 32]) + " to " +
+                    placeText(S.points[uses[k].first & 0xffffffff]) +
+                    " is non-manifold: triangles " + name(c) + ", " + name(d) + " and " +
+                    name(uses[k + 2].second) + " share it; split the surface there into several");
+    neighbours[c / 3][c % 3] = d / 3;
+    neighbours[d / 3][d % 3] = c / 3;
+  }
+  return neighbours;
 }
 
 std::vector<std::vector<int>> rimLoops(const TriangleSurface& S) {
-  std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
+  const std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
   std::vector<int> next(S.points.size(), -1);
-  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t)
+  for (std::size_t t = 0; t < S.triangles.size(); ++t)
     for (int i = 0; i < 3; ++i)
       if (neighbours[t][i] < 0) next[S.triangles[t][i]] = S.triangles[t][(i + 1) % 3];
   std::vector<std::vector<int>> loops;
   for (int start = 0; start < static_cast<int>(next.size()); ++start) {
     if (next[start] < 0) continue;
     loops.emplace_back();
-    for (int n = start; n >= 0 && next[n] >= 0;) {
+    for (int n = start; next[n] >= 0;) {
       loops.back().push_back(n);
-      int after = next[n];
-      next[n] = -1;
-      n = after;
+      n = std::exchange(next[n], -1);
     }
   }
   return loops;
@@ -959,29 +901,21 @@ std::vector<std::vector<int>> rimLoops(const TriangleSurface& S) {
 TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings) {
   checkNumbers(S);
   CleanSurface C = weldAndDrop(S, warnings);
+  if (S.triangles.empty()) refuseSurface("the surface is empty; give at least one triangle");
   if (C.S.triangles.empty())
-    refuseSurface(S.triangles.empty()
-                      ? "the surface is empty; give at least one triangle"
-                      : "the surface is empty: all its " + std::to_string(S.triangles.size()) +
-                            " triangles have zero area; check its coordinates");
-  std::vector<std::array<int, 3>> neighbours = neighboursNumbered(C.S, C.origin);
+    refuseSurface("the surface is empty: all its " + std::to_string(S.triangles.size()) +
+                  " triangles have zero area; check its coordinates");
+  const std::vector<std::array<int, 3>> neighbours = triangleNeighbours(C.S, C.origin);
   checkFans(C, neighbours);
-
-  std::vector<int> sizes = componentSizes(neighbours);
-  if (sizes.size() > 1) {
-    std::sort(sizes.rbegin(), sizes.rend());
+  const std::vector<int> sizes = componentSizes(neighbours);
+  if (sizes.size() > 1)
     refuseSurface("the surface has " + std::to_string(sizes.size()) +
                   " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
                   std::to_string(sizes.back()) + " triangles); insert them one by one");
-  }
-  int turned = 0;
-  std::array<int, 2> at{0, 0};
-  if (!orientConsistently(C.S, neighbours, turned, at))
-    refuseSurface(
-        "the surface is not orientable (a Moebius band): no orientation fits at the edge from " +
-        placeText(C.S.points[at[0]]) + " to " + placeText(C.S.points[at[1]]) + "; cut it open");
+  const int turned = orientConsistently(C.S, neighbours);
+  if (turned < 0) refuseSurface("the surface is not orientable (a Moebius band); cut it open");
   if (turned > 0)
-    warnings.push_back("§3.1: turned " + counted(turned, "triangle", "triangles") +
+    warnings.push_back("§3.1: turned " + counted(turned, "triangle") +
                        " to give the surface a single orientation");
   checkDisk(C.S);
   return C.S;
@@ -991,36 +925,31 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
 
 namespace {
 
-/// Nearest point of the segment ab as ClosestPoint of edge `which`; weights go to slots i and j.
-void keepNearerOnSegment(Vec3 x, Vec3 a, Vec3 b, int i, ClosestPoint& best) {
-  Vec3 d = b - a;
-  double length2 = norm2(d), t = length2 > 0 ? dot(x - a, d) / length2 : 0;
-  t = std::min(std::max(t, 0.0), 1.0);
-  Vec3 p = t < .5 ? a + t * d : b - (1 - t) * d;  // exact at both ends
-  double distance = norm(x - p);
+constexpr double beyondAll = 1e300;  // beyond every coordinate; its square is not needed
+constexpr int trianglesPerLeaf = 4;
+/// A box is skipped where it is farther by more than this fraction: rounding of distances.
+constexpr double boxMargin = 1e-12;
+
+/// Takes the nearest point of the edge from corner i to the next over into best if it is nearer.
+void keepNearerOnEdge(Vec3 x, const std::array<Vec3, 3>& corner, int i, ClosestPoint& best) {
+  const int j = (i + 1) % 3;
+  const Vec3 a = corner[i], b = corner[j], d = b - a;
+  const double length2 = norm2(d);
+  const double t = length2 > 0 ? std::clamp(dot(x - a, d) / length2, 0.0, 1.0) : 0;
+  const Vec3 p = t < .5 ? a + t * d : b - (1 - t) * d;  // exact at both ends
+  const double distance = norm(x - p);
   if (distance >= best.distance) return;
-  int j = (i + 1) % 3;
-  best.distance = distance;
-  best.point = p;
-  best.w[0] = best.w[1] = best.w[2] = 0;
+  const bool inside = t > 0 && t < 1;
+  best = {distance, p, 0, {0, 0, 0}, inside ? Feature::edge : Feature::vertex, t < 1 ? i : j};
   best.w[i] = 1 - t;
   best.w[j] = t;
-  best.feature = t > 0 && t < 1 ? Feature::edge : Feature::vertex;
-  best.which = t >= 1 ? j : i;
 }
 
-double boxDistance2(const TriangleTree::Box& box, Vec3 x) {
-  Vec3 d{std::max({box.lo.x - x.x, x.x - box.hi.x, 0.0}),
-         std::max({box.lo.y - x.y, x.y - box.hi.y, 0.0}),
-         std::max({box.lo.z - x.z, x.z - box.hi.z, 0.0})};
-  return norm2(d);
-}
-
-double boxDistance2(const TriangleTree::Box& a, const TriangleTree::Box& b) {
-  Vec3 d{std::max({a.lo.x - b.hi.x, b.lo.x - a.hi.x, 0.0}),
-         std::max({a.lo.y - b.hi.y, b.lo.y - a.hi.y, 0.0}),
-         std::max({a.lo.z - b.hi.z, b.lo.z - a.hi.z, 0.0})};
-  return norm2(d);
+/// Distance of two boxes, 0 where they meet; a point is a box too.
+double boxDistance(const TriangleTree::Box& a, const TriangleTree::Box& b) {
+  return norm(Vec3{std::max({a.lo.x - b.hi.x, b.lo.x - a.hi.x, 0.0}),
+                   std::max({a.lo.y - b.hi.y, b.lo.y - a.hi.y, 0.0}),
+                   std::max({a.lo.z - b.hi.z, b.lo.z - a.hi.z, 0.0})});
 }
 
 void growBox(TriangleTree::Box& box, Vec3 p) {
@@ -1028,10 +957,50 @@ void growBox(TriangleTree::Box& box, Vec3 p) {
   box.hi = {std::max(box.hi.x, p.x), std::max(box.hi.y, p.y), std::max(box.hi.z, p.z)};
 }
 
-constexpr double beyondAll = 1e300;  // beyond every coordinate; its square is not needed
-constexpr int trianglesPerLeaf = 4;
-/// Rounding of distances: a box is skipped only where it is farther by more than this fraction.
-constexpr double boxMargin = 1e-12;
+/// Recursive median split of tree.triangle[first, last) along the longest side of the centres' box.
+void buildTreeNode(TriangleTree& tree, const std::vector<std::array<Vec3, 3>>& corners,
+                   const std::vector<Vec3>& centres, int first, int last) {
+  const auto order = tree.triangle.begin();
+  TriangleTree::Box box = boxOf(corners[order[first]]);
+  TriangleTree::Box middle{centres[order[first]], centres[order[first]]};
+  for (int i = first; i < last; ++i) {
+    for (Vec3 p : corners[order[i]]) growBox(box, p);
+    growBox(middle, centres[order[i]]);
+  }
+  const std::size_t self = tree.nodes.size();
+  const bool isLeaf = last - first <= trianglesPerLeaf;
+  tree.nodes.push_back({box, first, isLeaf ? last - first : 0, -1});
+  if (isLeaf) return;
+  const Vec3 d = middle.hi - middle.lo;
+  double Vec3::*axis = d.x >= d.y && d.x >= d.z ? &Vec3::x : d.y >= d.z ? &Vec3::y : &Vec3::z;
+  const int half = (first + last) / 2;
+  std::nth_element(order + first, order + half, order + last, [&](int a, int b) {
+    return std::make_pair(centres[a].*axis, a) < std::make_pair(centres[b].*axis, b);
+  });
+  buildTreeNode(tree, corners, centres, first, half);
+  tree.nodes[self].right = static_cast<int>(tree.nodes.size());
+  buildTreeNode(tree, corners, centres, half, last);
+}
+
+/// Calls visit(i) for the triangles (in tree order) of leaves not farther from `box` than `bound`,
+/// which visit() lowers; the nearer child first. From node n at `distance` on.
+template <class Visit>
+void visitNearest(const TriangleTree& tree, int n, double distance, const TriangleTree::Box& box,
+                  const double& bound, const Visit& visit) {
+  if (distance > bound * (1 + boxMargin)) return;
+  const TriangleTree::Node& node = tree.nodes[n];
+  for (int i = node.first; i < node.first + node.count; ++i) visit(i);
+  if (node.count > 0) return;
+  int near = n + 1, far = node.right;
+  double toNear = boxDistance(tree.nodes[near].box, box);
+  double toFar = boxDistance(tree.nodes[far].box, box);
+  if (toFar < toNear) {
+    std::swap(near, far);
+    std::swap(toNear, toFar);
+  }
+  visitNearest(tree, near, toNear, box, bound, visit);
+  visitNearest(tree, far, toFar, box, bound, visit);
+}
 
 }  // namespace
 
@@ -1042,170 +1011,110 @@ TriangleTree::Box boxOf(const std::array<Vec3, 3>& corners) {
   return box;
 }
 
-namespace {
-
-/// Recursive median split of order[first, last) along the longest side of the centroids' box.
-void buildTreeNode(TriangleTree& tree, const std::vector<std::array<Vec3, 3>>& corners,
-                   const std::vector<Vec3>& centres, std::vector<int>& order, int first, int last) {
-  TriangleTree::Box box = boxOf(corners[order[first]]),
-                    middle{centres[order[first]], centres[order[first]]};
-  for (int i = first; i < last; ++i) {
-    for (const Vec3& p : corners[order[i]]) growBox(box, p);
-    growBox(middle, centres[order[i]]);
-  }
-  const int self = static_cast<int>(tree.nodes.size());
-  tree.nodes.push_back({box, first, last - first, -1});
-  if (last - first <= trianglesPerLeaf) return;
-  Vec3 d = middle.hi - middle.lo;
-  double Vec3::*axis = d.x >= d.y && d.x >= d.z ? &Vec3::x : d.y >= d.z ? &Vec3::y : &Vec3::z;
-  int half = (first + last) / 2;
-  std::nth_element(order.begin() + first, order.begin() + half, order.begin() + last,
-                   [&](int a, int b) {
-                     double p = centres[a].*axis, q = centres[b].*axis;
-                     return p != q ? p < q : a < b;
-                   });
-  tree.nodes[self].count = 0;
-  buildTreeNode(tree, corners, centres, order, first, half);
-  tree.nodes[self].right = static_cast<int>(tree.nodes.size());
-  buildTreeNode(tree, corners, centres, order, half, last);
-}
-
-}  // namespace
-
 ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
   ClosestPoint best{beyondAll, a, 0, {1, 0, 0}, Feature::vertex, 0};
-  keepNearerOnSegment(x, a, b, 0, best);
-  keepNearerOnSegment(x, b, c, 1, best);
-  keepNearerOnSegment(x, c, a, 2, best);
+  for (int i = 0; i < 3; ++i) keepNearerOnEdge(x, {a, b, c}, i, best);
 
   // The foot of the perpendicular, where it is inside: w are the areas seen from it.
-  Vec3 n = cross(b - a, c - a);
-  double n2 = norm2(n);
-  if (!(n2 > 0)) return best;
-  double w1 = dot(cross(x - a, c - a), n) / n2, w2 = dot(cross(b - a, x - a), n) / n2,
-         w0 = 1 - w1 - w2;
-  if (!(w0 > 0 && w1 > 0 && w2 > 0)) return best;
-  Vec3 p = a + (w1 * (b - a) + w2 * (c - a));
-  double distance = norm(x - p);
+  const Vec3 n = cross(b - a, c - a);
+  const double n2 = norm2(n);
+  const double w1 = dot(cross(x - a, c - a), n) / n2, w2 = dot(cross(b - a, x - a), n) / n2;
+  const double w0 = 1 - w1 - w2;
+  if (!(w0 > 0 && w1 > 0 && w2 > 0)) return best;  // also where n = 0
+  const Vec3 p = a + (w1 * (b - a) + w2 * (c - a));
+  const double distance = norm(x - p);
   if (distance < best.distance) best = {distance, p, 0, {w0, w1, w2}, Feature::face, 0};
   return best;
 }
 
 TriangleTree::TriangleTree(const std::vector<Vec3>& points,
-                           const std::vector<std::array<int, 3>>& triangles) {
-  const int N = static_cast<int>(triangles.size());
-  std::vector<std::array<Vec3, 3>> all(N);
-  std::vector<Vec3> centres(N);
-  triangle.resize(N);
-  for (int t = 0; t < N; ++t) {
-    for (int i = 0; i < 3; ++i) all[t][i] = points[triangles[t][i]];
-    Box box = boxOf(all[t]);
-    centres[t] = .5 * (box.lo + box.hi);
-    triangle[t] = t;
+                           const std::vector<std::array<int, 3>>& triangles)
+    : triangle(triangles.size()) {
+  std::vector<std::array<Vec3, 3>> all;
+  std::vector<Vec3> centres;
+  for (const std::array<int, 3>& t : triangles) {
+    all.push_back({points[t[0]], points[t[1]], points[t[2]]});
+    const Box box = boxOf(all.back());
+    centres.push_back(.5 * (box.lo + box.hi));
   }
-  if (N > 0) buildTreeNode(*this, all, centres, triangle, 0, N);
+  std::iota(triangle.begin(), triangle.end(), 0);
+  if (!all.empty()) buildTreeNode(*this, all, centres, 0, static_cast<int>(all.size()));
   for (int t : triangle) corners.push_back(all[t]);
 }
 
 ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
-  struct Entry {
-    int node;
-    double distance;
-  };
-  std::array<Entry, 64>
-      stack;  // depth first, so one entry per level: 64 levels hold 2^64 triangles
-  int top = 0;
-  if (!nodes.empty()) stack[top++] = {0, std::sqrt(boxDistance2(nodes[0].box, x))};
-  while (top > 0) {
-    Entry entry = stack[--top];
-    if (entry.distance > best.distance * (1 + boxMargin)) continue;
-    const Node& node = nodes[entry.node];
-    for (int i = node.first; i < node.first + node.count; ++i) {
-      ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
-      p.triangle = triangle[i];
-      bool lower = p.distance == best.distance && p.triangle < best.triangle;
-      if (p.distance < best.distance || lower) best = p;
-    }
-    if (node.count > 0) continue;
-    Entry left{entry.node + 1, std::sqrt(boxDistance2(nodes[entry.node + 1].box, x))};
-    Entry right{node.right, std::sqrt(boxDistance2(nodes[node.right].box, x))};
-    if (left.distance < right.distance) std::swap(left, right);
-    stack[top++] = left;  // the nearer one is visited first
-    stack[top++] = right;
-  }
+  if (nodes.empty()) return best;
+  visitNearest(*this, 0, boxDistance(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
+    ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
+    p.triangle = triangle[i];
+    const bool lower = p.distance == best.distance && p.triangle < best.triangle;
+    if (p.distance < best.distance || lower) best = p;
+  });
   return best;
 }
 
 namespace {
 
 Vec3 unitVector(Vec3 v) {
-  double length = norm(v);
+  const double length = norm(v);
   return length > 0 ? (1 / length) * v : v;
-}
-
-double angleOf(Vec3 a, Vec3 b) { return std::atan2(norm(cross(a, b)), dot(a, b)); }
-
-/// Segments of a closed loop as triangles with a double corner.
-TriangleTree loopTree(const std::vector<Vec3>& points, const std::vector<int>& loop) {
-  std::vector<std::array<int, 3>> segments;
-  for (size_t i = 0; i < loop.size(); ++i) {
-    int a = loop[i], b = loop[(i + 1) % loop.size()];
-    segments.push_back({a, b, b});
-  }
-  return TriangleTree(points, segments);
 }
 
 }  // namespace
 
 SurfaceDistance::SurfaceDistance(const TriangleSurface& cleaned)
-    : S(cleaned), tree(S.points, S.triangles), neighbours(triangleNeighbours(S)) {
-  std::vector<std::vector<int>> rims = rimLoops(S);
+    : S(cleaned),
+      tree(S.points, S.triangles),
+      faceNormal(S.triangles.size()),
+      edgeNormal(S.triangles.size()),
+      vertexNormal(S.points.size()),
+      neighbours(triangleNeighbours(S)),
+      isRimPoint(S.points.size(), 0) {
+  const std::vector<std::vector<int>> rims = rimLoops(S);
   if (rims.size() != 1)
     throw InputError("SurfaceDistance: the surface has " + std::to_string(rims.size()) +
                      " rims; call checkSurface() first");
   rim = rims[0];
-  rimTree = loopTree(S.points, rim);
-  isRimPoint.assign(S.points.size(), 0);
-  for (int n : rim) isRimPoint[n] = 1;
+  std::vector<std::array<int, 3>> segments;  // as triangles with a double corner
+  for (std::size_t i = 0; i < rim.size(); ++i) {
+    const int b = rim[(i + 1) % rim.size()];
+    segments.push_back({rim[i], b, b});
+    isRimPoint[rim[i]] = 1;
+  }
+  rimTree = TriangleTree(S.points, segments);
 
   // Angle-weighted pseudo-normals: their side is right at every nearest point (Baerentzen and
   // Aanaes 2005).
-  const size_t N = S.triangles.size();
-  faceNormal.resize(N);
-  edgeNormal.resize(N);
-  vertexNormal.assign(S.points.size(), {0, 0, 0});
-  for (size_t t = 0; t < N; ++t) {
+  for (std::size_t t = 0; t < S.triangles.size(); ++t) {
     const std::array<int, 3>& v = S.triangles[t];
-    faceNormal[t] =
-        unitVector(cross(S.points[v[1]] - S.points[v[0]], S.points[v[2]] - S.points[v[0]]));
     for (int i = 0; i < 3; ++i) {
-      Vec3 a = S.points[v[(i + 1) % 3]] - S.points[v[i]],
-           b = S.points[v[(i + 2) % 3]] - S.points[v[i]];
-      vertexNormal[v[i]] += angleOf(a, b) * faceNormal[t];
+      const Vec3 a = S.points[v[(i + 1) % 3]] - S.points[v[i]];
+      const Vec3 b = S.points[v[(i + 2) % 3]] - S.points[v[i]], n = cross(a, b);
+      if (i == 0) faceNormal[t] = unitVector(n);
+      vertexNormal[v[i]] += std::atan2(norm(n), dot(a, b)) * faceNormal[t];
     }
   }
-  for (size_t t = 0; t < N; ++t)
+  for (std::size_t t = 0; t < S.triangles.size(); ++t)
     for (int i = 0; i < 3; ++i) {
-      int s = neighbours[t][i];
+      const int s = neighbours[t][i];
       edgeNormal[t][i] = s < 0 ? faceNormal[t] : unitVector(faceNormal[t] + faceNormal[s]);
     }
   for (Vec3& n : vertexNormal) n = unitVector(n);
 }
 
 SurfaceQuery SurfaceDistance::query(Vec3 x) const {
-  ClosestPoint p = tree.closest(x);
-  SurfaceQuery q{p.distance, p.point, p.triangle, {p.w[0], p.w[1], p.w[2]}, faceNormal[p.triangle],
-                 0,          false,   0};
+  const ClosestPoint p = tree.closest(x);
+  SurfaceQuery q{p, faceNormal[p.triangle], 0, false, 0};
   if (p.feature == Feature::edge) {
     q.normal = edgeNormal[p.triangle][p.which];
     q.onRim = neighbours[p.triangle][p.which] < 0;
   } else if (p.feature == Feature::vertex) {
-    int n = S.triangles[p.triangle][p.which];
+    const int n = S.triangles[p.triangle][p.which];
     q.normal = vertexNormal[n];
     q.onRim = isRimPoint[n] != 0;
   }
-  Vec3 d = x - q.point;
+  const Vec3 d = x - p.point;
   q.side = dot(d, q.normal);
   if (q.onRim) q.excess = norm(d - q.side * q.normal);
   return q;
@@ -1215,33 +1124,22 @@ double SurfaceDistance::rimDistance(Vec3 x) const { return rimTree.closest(x).di
 
 namespace {
 
-/// Distance of the segments ab and cd; `on` is the nearest point of ab.
-double segmentDistance(Vec3 a, Vec3 b, Vec3 c, Vec3 d, Vec3& on) {
-  Vec3 u = b - a, v = d - c, r = a - c;
-  double uu = norm2(u), vv = norm2(v), uv = dot(u, v), ur = dot(u, r), vr = dot(v, r),
-         D = uu * vv - uv * uv;
-  double best = beyondAll;
-  auto keep = [&](double s, double t) {
-    Vec3 p = a + s * u, q = c + t * v;
-    if (norm(p - q) < best) {
-      best = norm(p - q);
-      on = p;
-    }
-  };
-  auto clamp = [](double t) { return std::min(std::max(t, 0.0), 1.0); };
-  if (D > 0) {
-    double s = (uv * vr - vv * ur) / D, t = (uu * vr - uv * ur) / D;
-    if (s >= 0 && s <= 1 && t >= 0 && t <= 1) keep(s, t);
-  }
-  for (double s : {0.0, 1.0}) keep(s, vv > 0 ? clamp((vr + s * uv) / vv) : 0);
-  for (double t : {0.0, 1.0}) keep(uu > 0 ? clamp((t * uv - ur) / uu) : 0, t);
-  return best;
+/// The points a + s (b − a) and c + t (d − c) where two lines are nearest, if both are inside the
+/// segments: false elsewhere, where an end is nearest.
+bool nearestInside(Vec3 a, Vec3 b, Vec3 c, Vec3 d, Vec3& onAB, Vec3& onCD) {
+  const Vec3 u = b - a, v = d - c, r = a - c;
+  const double uu = norm2(u), vv = norm2(v), uv = dot(u, v), D = uu * vv - uv * uv;
+  const double s = (uv * dot(v, r) - vv * dot(u, r)) / D;
+  const double t = (uu * dot(v, r) - uv * dot(u, r)) / D;
+  onAB = a + s * u;
+  onCD = c + t * v;
+  return D > 0 && s >= 0 && s <= 1 && t >= 0 && t <= 1;
 }
 
 /// Whether the segment pq crosses the triangle; `at` is where.
 bool segmentCrosses(Vec3 p, Vec3 q, const std::array<Vec3, 3>& t, Vec3& at) {
-  Vec3 n = cross(t[1] - t[0], t[2] - t[0]);
-  double dp = dot(p - t[0], n), dq = dot(q - t[0], n);
+  const Vec3 n = cross(t[1] - t[0], t[2] - t[0]);
+  const double dp = dot(p - t[0], n), dq = dot(q - t[0], n);
   if ((dp > 0 && dq > 0) || (dp < 0 && dq < 0) || dp == dq) return false;
   at = p + (dp / (dp - dq)) * (q - p);
   for (int i = 0; i < 3; ++i)
@@ -1249,47 +1147,35 @@ bool segmentCrosses(Vec3 p, Vec3 q, const std::array<Vec3, 3>& t, Vec3& at) {
   return true;
 }
 
-/// Distance of two triangles and the nearest point of A: corners to faces, edges to edges, or a
-/// crossing.
+/// Distance of two triangles and the nearest point of A: 0 at a crossing, else corners to triangles
+/// and insides of edges to each other.
 double trianglesDistance(const std::array<Vec3, 3>& A, const std::array<Vec3, 3>& B, Vec3& onA) {
   double best = beyondAll;
+  auto keep = [&](double distance, Vec3 p) {
+    if (distance >= best) return;
+    best = distance;
+    onA = p;
+  };
   for (int i = 0; i < 3; ++i) {
-    Vec3 at;
-    bool crossing =
-        segmentCrosses(A[i], A[(i + 1) % 3], B, at) || segmentCrosses(B[i], B[(i + 1) % 3], A, at);
-    if (crossing) {
-      onA = at;
-      return 0;
-    }
-    ClosestPoint p = closestPointOnTriangle(B[i], A[0], A[1], A[2]),
-                 q = closestPointOnTriangle(A[i], B[0], B[1], B[2]);
-    if (p.distance < best) {
-      best = p.distance;
-      onA = p.point;
-    }
-    if (q.distance < best) {
-      best = q.distance;
-      onA = A[i];
-    }
-    for (int j = 0; j < 3; ++j) {
-      double d = segmentDistance(A[i], A[(i + 1) % 3], B[j], B[(j + 1) % 3], at);
-      if (d < best) {
-        best = d;
-        onA = at;
-      }
-    }
+    const Vec3 a = A[i], aNext = A[(i + 1) % 3];
+    Vec3 p, q;
+    if (segmentCrosses(a, aNext, B, p) || segmentCrosses(B[i], B[(i + 1) % 3], A, p)) keep(0, p);
+    const ClosestPoint nearest = closestPointOnTriangle(B[i], A[0], A[1], A[2]);
+    keep(nearest.distance, nearest.point);
+    keep(closestPointOnTriangle(a, B[0], B[1], B[2]).distance, a);
+    for (int j = 0; j < 3; ++j)
+      if (nearestInside(a, aNext, B[j], B[(j + 1) % 3], p, q)) keep(norm(p - q), p);
   }
   return best;
 }
 
-/// Largest distance of sampled points of A from B.
+/// Largest distance of points of A, a lattice of m steps on each triangle, from B.
 double sampledDistance(const TriangleTree& A, const TriangleTree& B, int m) {
   double largest = 0;
   for (const std::array<Vec3, 3>& c : A.corners)
     for (int i = 0; i <= m; ++i)
-      for (int j = 0; j <= m - i; ++j) {
-        Vec3 p = (1.0 / m) *
-                 (static_cast<double>(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
+      for (int j = 0; i + j <= m; ++j) {
+        const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
         largest = std::max(largest, B.closest(p).distance);
       }
   return largest;
@@ -1300,30 +1186,16 @@ double sampledDistance(const TriangleTree& A, const TriangleTree& B, int m) {
 Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
                 const std::vector<std::array<int, 3>>& triangles) {
   Gap gap{beyondAll, -1, -1, {}};
-  std::vector<int> stack;
-  for (int o = 0; o < static_cast<int>(triangles.size()) && !tree.nodes.empty(); ++o) {
-    std::array<Vec3, 3> other{points[triangles[o][0]], points[triangles[o][1]],
-                              points[triangles[o][2]]};
-    TriangleTree::Box box = boxOf(other);
-    stack.assign(1, 0);
-    while (!stack.empty()) {
-      int n = stack.back();
-      stack.pop_back();
-      const TriangleTree::Node& node = tree.nodes[n];
-      if (std::sqrt(boxDistance2(node.box, box)) >= gap.distance) continue;
-      if (node.count == 0) {
-        int near = n + 1, far = node.right;
-        if (boxDistance2(tree.nodes[far].box, box) < boxDistance2(tree.nodes[near].box, box))
-          std::swap(near, far);
-        stack.push_back(far);
-        stack.push_back(near);
-      }
-      for (int i = node.first; i < node.first + node.count; ++i) {
-        Vec3 on;
-        double d = trianglesDistance(tree.corners[i], other, on);
-        if (d < gap.distance) gap = {d, tree.triangle[i], o, on};
-      }
-    }
+  for (std::size_t o = 0; o < triangles.size() && !tree.nodes.empty(); ++o) {
+    const std::array<int, 3>& v = triangles[o];
+    const std::array<Vec3, 3> other{points[v[0]], points[v[1]], points[v[2]]};
+    const TriangleTree::Box box = boxOf(other);
+    const double start = boxDistance(tree.nodes[0].box, box);
+    visitNearest(tree, 0, start, box, gap.distance, [&](int i) {
+      Vec3 on;
+      const double d = trianglesDistance(tree.corners[i], other, on);
+      if (d < gap.distance) gap = {d, tree.triangle[i], static_cast<int>(o), on};
+    });
   }
   return gap;
 }
@@ -2358,136 +2230,91 @@ namespace {
 using RealVector = std::vector<double>;
 
 double innerProduct(const RealVector& a, const RealVector& b) {
-  double sum = 0;
-  for (size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
-  return sum;
+  return std::inner_product(a.begin(), a.end(), b.begin(), 0.0);
 }
 
 double normOf(const RealVector& a) { return std::sqrt(innerProduct(a, a)); }
 
+/// y += t a
+void addMultiple(RealVector& y, double t, const RealVector& a) {
+  for (std::size_t i = 0; i < y.size(); ++i) y[i] += t * a[i];
+}
+
 RealVector productOf(const SparseMatrix& A, const RealVector& x) {
-  RealVector y(x.size());
-  for (size_t i = 0; i < y.size(); ++i) {
-    double sum = 0;
-    for (int k = A.start[i]; k < A.start[i + 1]; ++k) sum += A.value[k] * x[A.column[k]];
-    y[i] = sum;
-  }
+  RealVector y(x.size(), 0.0);
+  for (std::size_t i = 0; i < y.size(); ++i)
+    for (int k = A.start[i]; k < A.start[i + 1]; ++k) y[i] += A.value[k] * x[A.column[k]];
   return y;
 }
 
-/// A pivot below this fraction of its row's largest entry counts as vanished.
-constexpr double smallestPivot = 1e-12;
-
-/// Incomplete factors with the pattern of A: unit lower L and upper U in one matrix, or only the
-/// diagonal.
-struct Preconditioner {
-  SparseMatrix LU;
-  std::vector<int> diagonal;  // entry of each row's pivot
-  RealVector inversePivot;
-  bool jacobi = false;
-};
-
-void useJacobi(Preconditioner& P, const SparseMatrix& A) {
-  P.jacobi = true;
-  for (size_t i = 0; i < P.diagonal.size(); ++i) P.inversePivot[i] = 1 / A.value[P.diagonal[i]];
-}
-
-/// [choice] Share of the fill dropped by ILU(0) that goes to the pivot instead. Near 1 it keeps row
-/// sums, which halves the iterations for long waves; at 1 the pivots of a long chain of points with
-/// row sum 0 vanish.
-constexpr double fillToPivot = .97;
-
-/// Relaxed ILU(0): Gaussian elimination that drops what falls outside the pattern of A.
-Preconditioner incompleteLU(const SparseMatrix& A) {
-  const int n = static_cast<int>(A.start.size()) - 1;
-  Preconditioner P{A, std::vector<int>(n, -1), {}, false};
-  std::vector<int> entry(n, -1);  // entry of the current row in each column
-  RealVector& a = P.LU.value;
-  for (int i = 0; i < n; ++i) {
-    double largest = 0, dropped = 0;
-    for (int k = A.start[i]; k < A.start[i + 1]; ++k) {
-      entry[A.column[k]] = k;
-      if (A.column[k] == i) P.diagonal[i] = k;
-      largest = std::max(largest, std::fabs(A.value[k]));
-    }
-    for (int k = A.start[i]; k < A.start[i + 1] && A.column[k] < i; ++k) {
-      int r = A.column[k];
-      if (P.jacobi) break;
-      a[k] /= a[P.diagonal[r]];
-      for (int l = P.diagonal[r] + 1; l < A.start[r + 1]; ++l) {
-        int at = entry[A.column[l]];
-        (at >= 0 ? a[at] : dropped) -= a[k] * a[l];
-      }
-    }
-    for (int k = A.start[i]; k < A.start[i + 1]; ++k) entry[A.column[k]] = -1;
-    if (P.diagonal[i] < 0 || A.value[P.diagonal[i]] == 0)
-      throw SolverError("solveBiCGSTAB (§3.6): row " + std::to_string(i) +
-                        " has no diagonal entry");
-    a[P.diagonal[i]] += fillToPivot * dropped;
-    if (!(std::fabs(a[P.diagonal[i]]) > smallestPivot * largest)) P.jacobi = true;
-  }
-  for (int d : P.diagonal) P.inversePivot.push_back(1 / P.LU.value[d]);
-  if (P.jacobi) useJacobi(P, A);
-  return P;
-}
-
-RealVector applyPreconditioner(const Preconditioner& P, const RealVector& b) {
-  const SparseMatrix& LU = P.LU;
-  const int n = static_cast<int>(b.size());
-  RealVector y = b;
-  if (P.jacobi) {
-    for (int i = 0; i < n; ++i) y[i] *= P.inversePivot[i];
-    return y;
-  }
-  for (int i = 0; i < n; ++i) {  // L y = b
-    double sum = y[i];
-    for (int k = LU.start[i]; k < P.diagonal[i]; ++k) sum -= LU.value[k] * y[LU.column[k]];
-    y[i] = sum;
-  }
-  for (int i = n - 1; i >= 0; --i) {  // U y = y
-    double sum = y[i];
-    for (int k = P.diagonal[i] + 1; k < LU.start[i + 1]; ++k) sum -= LU.value[k] * y[LU.column[k]];
-    y[i] = sum * P.inversePivot[i];
-  }
-  return y;
-}
-
+/// b − A x
 RealVector residualOf(const SparseMatrix& A, const RealVector& b, const RealVector& x) {
-  RealVector r = productOf(A, x);
-  for (size_t i = 0; i < r.size(); ++i) r[i] = b[i] - r[i];
+  RealVector r = b;
+  addMultiple(r, -1, productOf(A, x));
   return r;
 }
 
-/// y += t a
-void addMultiple(RealVector& y, double t, const RealVector& a) {
-  for (size_t i = 0; i < y.size(); ++i) y[i] += t * a[i];
+/// [choice] ω of the preconditioner, in (0, 2): above 1 it reaches far across large surfaces.
+constexpr double overRelaxation = 1.75;
+
+/// Solves M z = r with M = (D + ωL) D⁻¹ (D + ωU), the symmetric successive over-relaxation (SSOR)
+/// preconditioner of A = L + D + U; `diagonal` are the entries of D.
+RealVector precondition(const SparseMatrix& A, const std::vector<int>& diagonal, RealVector z) {
+  const int n = static_cast<int>(z.size());
+  for (int i = 0; i < n; ++i) {  // (D + ωL) z = r
+    double sum = 0;
+    for (int k = A.start[i]; k < diagonal[i]; ++k) sum += A.value[k] * z[A.column[k]];
+    z[i] = (z[i] - overRelaxation * sum) / A.value[diagonal[i]];
+  }
+  for (int i = n - 1; i >= 0; --i) {  // (D + ωU) z' = D z
+    double sum = 0;
+    for (int k = diagonal[i] + 1; k < A.start[i + 1]; ++k) sum += A.value[k] * z[A.column[k]];
+    z[i] -= overRelaxation * sum / A.value[diagonal[i]];
+  }
+  return z;
 }
 
-/// BiCGSTAB from x until |r| <= goal, the bound or a breakdown (van der Vorst 1992). Returns the
-/// iterations.
-int bicgstabRun(const SparseMatrix& A, const Preconditioner& P, const RealVector& b, RealVector& x,
-                double goal, int maxIterations) {
-  RealVector r = residualOf(A, b, x), r0 = r, p(r.size(), 0.0), v(r.size(), 0.0);
-  double rho = 1, alpha = 1, omega = 1;
+/// The entry of each row's diagonal.
+std::vector<int> diagonalOf(const SparseMatrix& A) {
+  std::vector<int> diagonal;
+  for (int i = 0; i + 1 < static_cast<int>(A.start.size()); ++i) {
+    const auto row = A.column.begin() + A.start[i], end = A.column.begin() + A.start[i + 1];
+    const auto at = std::lower_bound(row, end, i);
+    diagonal.push_back(static_cast<int>(at - A.column.begin()));
+    if (at == end || *at != i || A.value[diagonal[i]] == 0)
+      throw SolverError("solveBiCGSTAB (§3.6): row " + std::to_string(i) +
+                        " has no diagonal entry");
+  }
+  return diagonal;
+}
+
+/// BiCGSTAB from x until |r| <= goal, the bound or a breakdown (van der Vorst 1992).
+///   returns the iterations
+int bicgstabRun(const SparseMatrix& A, const std::vector<int>& diagonal, const RealVector& b,
+                RealVector& x, double goal, int maxIterations) {
+  RealVector r = residualOf(A, b, x), p = r;
+  const RealVector r0 = r;
+  double rho = innerProduct(r0, r);
   for (int iteration = 1; iteration <= maxIterations; ++iteration) {
-    double rhoNew = innerProduct(r0, r), beta = rhoNew / rho * (alpha / omega);
-    if (rhoNew == 0 || !std::isfinite(beta)) return iteration;
-    for (size_t i = 0; i < p.size(); ++i) p[i] = r[i] + beta * (p[i] - omega * v[i]);
-    RealVector pHat = applyPreconditioner(P, p);
-    v = productOf(A, pHat);
-    alpha = rhoNew / innerProduct(r0, v);
+    const RealVector pHat = precondition(A, diagonal, p), v = productOf(A, pHat);
+    const double alpha = rho / innerProduct(r0, v);
     if (!std::isfinite(alpha)) return iteration;
-    addMultiple(r, -alpha, v);  // r is now s
     addMultiple(x, alpha, pHat);
+    addMultiple(r, -alpha, v);  // r is now s
     if (normOf(r) <= goal) return iteration;
 
-    RealVector sHat = applyPreconditioner(P, r), t = productOf(A, sHat);
-    omega = innerProduct(t, r) / innerProduct(t, t);
-    if (!std::isfinite(omega) || omega == 0) return iteration;
+    const RealVector sHat = precondition(A, diagonal, r), t = productOf(A, sHat);
+    const double omega = innerProduct(t, r) / innerProduct(t, t);
+    if (!std::isfinite(omega)) return iteration;
     addMultiple(x, omega, sHat);
     addMultiple(r, -omega, t);
     if (normOf(r) <= goal) return iteration;
+
+    const double rhoNew = innerProduct(r0, r), beta = rhoNew / rho * (alpha / omega);
+    if (!std::isfinite(beta) || rhoNew == 0) return iteration;
     rho = rhoNew;
+    addMultiple(p, -omega, v);
+    for (std::size_t i = 0; i < p.size(); ++i) p[i] = r[i] + beta * p[i];
   }
   return maxIterations;
 }
@@ -2496,21 +2323,17 @@ int bicgstabRun(const SparseMatrix& A, const Preconditioner& P, const RealVector
 
 int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
                   double tolerance, int maxIterations) {
-  if (b.empty()) return 0;
-  Preconditioner P = incompleteLU(A);
+  const std::vector<int> diagonal = diagonalOf(A);
   const double goal = tolerance * normOf(b);
-  // The recurrence for r drifts from b - A x; each run starts again from the true one. Also after a
+  // The recurrence for r drifts from b − A x: a further run starts from the true one, also after a
   // breakdown.
   constexpr int maxRuns = 20;
   int iterations = 0;
   for (int run = 0; run < maxRuns && iterations < maxIterations; ++run) {
     if (normOf(residualOf(A, b, x)) <= goal) return iterations;
-    if (run == maxRuns / 2) useJacobi(P, A);
-    RealVector before = x;
-    iterations += bicgstabRun(A, P, b, x, goal, maxIterations - iterations);
-    if (!std::isfinite(normOf(x))) x = before;
+    iterations += bicgstabRun(A, diagonal, b, x, goal, maxIterations - iterations);
   }
-  double left = normOf(residualOf(A, b, x));
+  const double left = normOf(residualOf(A, b, x));
   if (left <= goal) return iterations;
   char text[160];
   std::snprintf(text, sizeof text,
@@ -2523,121 +2346,39 @@ int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vect
 
 double tanHalfAngle(Vec3 a, Vec3 b) {
   constexpr double largestTan = 2e8;  // α within 1e-8 of π, where |a×b| is rounding
-  double sine = norm(cross(a, b)), cosine = dot(a, b), both = norm(a) * norm(b);
-  if (cosine >= 0) return sine / (both + cosine);
-  return sine * largestTan > both - cosine ? (both - cosine) / sine : largestTan;
+  const double sine = norm(cross(a, b)), cosine = dot(a, b), both = norm(a) * norm(b);
+  return cosine >= 0 ? sine / (both + cosine) : std::min((both - cosine) / sine, largestTan);
 }
 
 namespace {
 
-/// Compressed rows from triplets; entries of the same place are added in the order given.
-struct Triplet {
+/// Compressed rows from entries; those of the same place are added.
+struct Entry {
   int row, column;
   double value;
 };
-SparseMatrix compressRows(const std::vector<Triplet>& triplets, int rows) {
-  std::vector<int> start(rows + 1, 0);
-  for (const Triplet& t : triplets) ++start[t.row + 1];
-  for (int i = 0; i < rows; ++i) start[i + 1] += start[i];
-  std::vector<int> order(triplets.size()), next(start.begin(), start.end() - 1);
-  for (int k = 0; k < static_cast<int>(triplets.size()); ++k) order[next[triplets[k].row]++] = k;
-
+SparseMatrix compressRows(std::vector<Entry> entries, std::size_t rows) {
+  std::stable_sort(entries.begin(), entries.end(), [](const Entry& a, const Entry& b) {
+    return a.row != b.row ? a.row < b.row : a.column < b.column;
+  });
   SparseMatrix A;
-  A.start.push_back(0);
-  for (int i = 0; i < rows; ++i) {
-    std::stable_sort(order.begin() + start[i], order.begin() + start[i + 1],
-                     [&](int a, int b) { return triplets[a].column < triplets[b].column; });
-    for (int k = start[i]; k < start[i + 1]; ++k) {
-      const Triplet& t = triplets[order[k]];
-      bool same = static_cast<int>(A.column.size()) > A.start[i] && A.column.back() == t.column;
-      if (same) A.value.back() += t.value;
-      else {
-        A.column.push_back(t.column);
-        A.value.push_back(t.value);
-      }
+  A.start.assign(rows + 1, 0);
+  for (std::size_t k = 0; k < entries.size(); ++k) {
+    const Entry& e = entries[k];
+    if (k > 0 && e.row == entries[k - 1].row && e.column == entries[k - 1].column) {
+      A.value.back() += e.value;
+    } else {
+      A.column.push_back(e.column);
+      A.value.push_back(e.value);
+      ++A.start[e.row + 1];
     }
-    A.start.push_back(static_cast<int>(A.column.size()));
   }
+  std::partial_sum(A.start.begin(), A.start.end(), A.start.begin());
   return A;
 }
 
-/// The inner points ring by ring from the rim: an order that suits ILU(0).
-std::vector<int> ringOrder(const SparseMatrix& lambda, const std::vector<char>& isRim) {
-  std::vector<int> order;
-  std::vector<char> seen = isRim;
-  auto add = [&](int n) {
-    if (!seen[n]) order.push_back(n);
-    seen[n] = 1;
-  };
-  for (int n = 0; n < static_cast<int>(isRim.size()); ++n)
-    for (int k = lambda.start[n]; k < lambda.start[n + 1]; ++k)
-      if (isRim[lambda.column[k]]) add(n);
-  for (size_t q = 0; q < order.size(); ++q)
-    for (int k = lambda.start[order[q]]; k < lambda.start[order[q] + 1]; ++k) add(lambda.column[k]);
-  return order;
-}
-
-/// The system of the inner points, (1 + μ_i) u_i − Σ λ_ij u_j, the fixed u_j on the right.
-struct InnerSystem {
-  SparseMatrix A;
-  std::vector<int> point;  // [rows]
-  RealVector b[2], x[2];   // right-hand sides and start values in u and v
-};
-InnerSystem innerSystem(const SparseMatrix& lambda, const std::vector<char>& isRim,
-                        const std::vector<Vec2>& u, const std::vector<double>& mu,
-                        const std::vector<Vec2>& anchor) {
-  InnerSystem I;
-  I.point = ringOrder(lambda, isRim);
-  std::vector<int> row(isRim.size(), -1);
-  for (int r = 0; r < static_cast<int>(I.point.size()); ++r) row[I.point[r]] = r;
-  I.A.start.push_back(0);
-  std::vector<std::pair<int, double>> entries;
-  for (int n : I.point) {
-    entries.assign(1, {row[n], 1 + mu[n]});
-    Vec2 right = mu[n] * anchor[n];
-    for (int k = lambda.start[n]; k < lambda.start[n + 1]; ++k) {
-      int j = lambda.column[k];
-      if (isRim[j]) right = right + lambda.value[k] * u[j];
-      else entries.push_back({row[j], -lambda.value[k]});
-    }
-    std::sort(entries.begin(), entries.end());
-    for (const std::pair<int, double>& e : entries) {
-      I.A.column.push_back(e.first);
-      I.A.value.push_back(e.second);
-    }
-    I.A.start.push_back(static_cast<int>(I.A.column.size()));
-    I.b[0].push_back(right.x);
-    I.b[1].push_back(right.y);
-    I.x[0].push_back(u[n].x);
-    I.x[1].push_back(u[n].y);
-  }
-  return I;
-}
-
-/// Gauss-Seidel sweeps on u_i += Σ λ_ij (u_j − u_i), which keep the differences of neighbours
-/// exact: parametric triangles of long limbs are smaller than a residual of 1e-12 resolves.
-void polishParameters(const SparseMatrix& lambda, const std::vector<char>& isRim,
-                      std::vector<Vec2>& u) {
-  constexpr int sweeps = 100;
-  const int n = static_cast<int>(isRim.size());
-  for (int sweep = 0; sweep < sweeps; ++sweep)
-    for (int m = 0; m < n; ++m) {
-      int i = sweep % 2 == 0 ? m : n - 1 - m;
-      if (isRim[i]) continue;
-      Vec2 d{0, 0};
-      for (int k = lambda.start[i]; k < lambda.start[i + 1]; ++k)
-        d = d + lambda.value[k] * (u[lambda.column[k]] - u[i]);
-      u[i] = u[i] + d;
-    }
-}
-
-/// [§3.6] The message of a map that is not injective.
-[[noreturn]] void refuseFolding(const char* which, size_t flipped, Vec3 at) {
-  throw MethodError(std::string("insertSurface (§3.6): ") + which +
-                    " is self-folding in parameter space: " + std::to_string(flipped) +
-                    " parametric triangles are not counter-clockwise, the first at " +
-                    placeText(at) +
-                    "; remesh the surface there with better triangles, or lower l_c");
+[[noreturn]] void refuseSM(const std::string& what) {
+  throw MethodError("insertSurface (§3.6): S_M " + what + "; lower l_c");
 }
 
 }  // namespace
@@ -2645,23 +2386,22 @@ void polishParameters(const SparseMatrix& lambda, const std::vector<char>& isRim
 SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
                               const std::vector<std::array<int, 3>>& triangles,
                               const std::vector<char>& fixed) {
-  std::vector<Triplet> triplets;
-  triplets.reserve(6 * triangles.size());
+  std::vector<Entry> entries;
   for (const std::array<int, 3>& t : triangles)
     for (int c = 0; c < 3; ++c) {
-      int i = t[c], j = t[(c + 1) % 3], k = t[(c + 2) % 3];
+      const int i = t[c], j = t[(c + 1) % 3], k = t[(c + 2) % 3];
       if (fixed[i]) continue;
-      Vec3 a = points[j] - points[i], b = points[k] - points[i];
-      double tangent = tanHalfAngle(a, b);  // tan(α/2) of the angle jik, for both of its sides
-      triplets.push_back({i, j, tangent / norm(a)});
-      triplets.push_back({i, k, tangent / norm(b)});
+      const Vec3 a = points[j] - points[i], b = points[k] - points[i];
+      const double tangent = tanHalfAngle(a, b);  // tan(α/2) of the angle jik, for both its sides
+      entries.push_back({i, j, tangent / norm(a)});
+      entries.push_back({i, k, tangent / norm(b)});
     }
-  SparseMatrix lambda = compressRows(triplets, static_cast<int>(points.size()));
-  for (size_t i = 0; i < points.size(); ++i) {
-    double sum = 0;
-    for (int k = lambda.start[i]; k < lambda.start[i + 1]; ++k) sum += lambda.value[k];
-    for (int k = lambda.start[i]; k < lambda.start[i + 1]; ++k)
-      lambda.value[k] /= sum;  // Σ_j λ_ij = 1
+  SparseMatrix lambda = compressRows(std::move(entries), points.size());
+  for (std::size_t i = 0; i < points.size(); ++i) {
+    const auto from = lambda.value.begin() + lambda.start[i];
+    const auto to = lambda.value.begin() + lambda.start[i + 1];
+    const double sum = std::accumulate(from, to, 0.0);
+    std::for_each(from, to, [sum](double& w) { w /= sum; });  // Σ_j λ_ij = 1
   }
   return lambda;
 }
@@ -2670,9 +2410,38 @@ std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
                                           const std::vector<char>& isRim, std::vector<Vec2> u,
                                           const std::vector<double>& mu,
                                           const std::vector<Vec2>& anchor) {
-  InnerSystem I = innerSystem(lambda, isRim, u, mu, anchor);
-  for (int c = 0; c < 2; ++c) solveBiCGSTAB(I.A, I.b[c], I.x[c]);
-  for (size_t i = 0; i < I.point.size(); ++i) u[I.point[i]] = {I.x[0][i], I.x[1][i]};
+  // Rows are the inner points, ring by ring from the rim: an order that suits the preconditioner.
+  std::vector<int> row(u.size(), -1), point;
+  auto add = [&](int n) {
+    if (isRim[n] || row[n] >= 0) return;
+    row[n] = static_cast<int>(point.size());
+    point.push_back(n);
+  };
+  for (int n = 0; n < static_cast<int>(u.size()); ++n)
+    for (int k = lambda.start[n]; k < lambda.start[n + 1]; ++k)
+      if (isRim[lambda.column[k]]) add(n);
+  for (std::size_t q = 0; q < point.size(); ++q)
+    for (int k = lambda.start[point[q]]; k < lambda.start[point[q] + 1]; ++k) add(lambda.column[k]);
+  std::vector<Entry> entries;
+  std::array<RealVector, 2> b, x;  // in the two coordinates
+  for (int n : point) {
+    entries.push_back({row[n], row[n], 1 + mu[n]});
+    Vec2 right = mu[n] * anchor[n];
+    for (int k = lambda.start[n]; k < lambda.start[n + 1]; ++k) {
+      const int j = lambda.column[k];
+      if (isRim[j])
+        right = right + lambda.value[k] * u[j];
+      else
+        entries.push_back({row[n], row[j], -lambda.value[k]});
+    }
+    b[0].push_back(right.x);
+    b[1].push_back(right.y);
+    x[0].push_back(u[n].x);
+    x[1].push_back(u[n].y);
+  }
+  const SparseMatrix A = compressRows(std::move(entries), point.size());
+  for (int c = 0; c < 2; ++c) solveBiCGSTAB(A, b[c], x[c]);
+  for (int n : point) u[n] = {x[0][row[n]], x[1][row[n]]};
   return u;
 }
 
@@ -2689,254 +2458,190 @@ std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangl
 std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
                                          const std::vector<std::array<int, 3>>& triangles,
                                          const std::vector<char>& isRim, std::vector<Vec2> u) {
-  SparseMatrix lambda = meanValueWeights(points, triangles, isRim);
-  for (size_t i = 0; i < u.size(); ++i)
+  const SparseMatrix lambda = meanValueWeights(points, triangles, isRim);
+  for (std::size_t i = 0; i < u.size(); ++i)
     if (!isRim[i]) u[i] = {.5, .5};
-  u = anchoredParametrization(lambda, isRim, u, std::vector<double>(u.size(), 0.0), u);
-  std::vector<int> flipped = flippedTriangles(triangles, u);
-  constexpr int polishes = 5;
-  for (int round = 0; round < polishes && !flipped.empty(); ++round) {
-    polishParameters(lambda, isRim, u);
-    flipped = flippedTriangles(triangles, u);
-  }
+  u = anchoredParametrization(lambda, isRim, u, RealVector(u.size(), 0.0), u);
+  const std::vector<int> flipped = flippedTriangles(triangles, u);
   if (!flipped.empty())
-    refuseFolding("Floater's map", flipped.size(), points[triangles[flipped[0]][0]]);
+    throw MethodError("insertSurface (§3.6): Floater's map is self-folding in parameter space: " +
+                      std::to_string(flipped.size()) +
+                      " parametric triangles are not counter-clockwise, the first at " +
+                      placeText(points[triangles[flipped[0]][0]]) +
+                      "; remesh the surface there with better triangles, or lower l_c");
   return u;
 }
 
 namespace {
 
-/// Bisects edge i of triangle t, and of its neighbour: the halves keep the orientation.
-void splitSurfaceEdge(TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours, int t,
-                      int i) {
-  std::array<int, 3> T = S.triangles[t];
-  int a = T[i], b = T[(i + 1) % 3], c = T[(i + 2) % 3], s = neighbours[t][i];
-  int m = static_cast<int>(S.points.size());
+/// Bisects edge i of triangle t, and of its neighbour s (-1: none): the halves keep the
+/// orientation.
+void splitSurfaceEdge(TriangleSurface& S, int t, int i, int s) {
+  const std::array<int, 3> T = S.triangles[t];
+  const int a = T[i], b = T[(i + 1) % 3], c = T[(i + 2) % 3];
+  const int m = static_cast<int>(S.points.size());
   S.points.push_back(.5 * (S.points[a] + S.points[b]));
   S.triangles[t] = {a, m, c};
   S.triangles.push_back({m, b, c});
   if (s < 0) return;
-  int j = sharedEdge(T, i, S.triangles[s]).edge, d = S.triangles[s][(j + 2) % 3];
+  const int d = S.triangles[s][(cornerAt(S.triangles[s], a) + 1) % 3];  // s is (b, a, d)
   S.triangles[s] = {b, m, d};
   S.triangles.push_back({m, a, d});
 }
 
-/// Triangle and edge of a rim's longest edge.
-std::array<int, 2> longestRimEdge(const TriangleSurface& S,
-                                  const std::vector<std::array<int, 3>>& neighbours) {
-  std::array<int, 2> at{-1, -1};
-  double longest = -1;
-  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t)
-    for (int i = 0; i < 3; ++i) {
-      double l = norm(S.points[S.triangles[t][(i + 1) % 3]] - S.points[S.triangles[t][i]]);
-      if (neighbours[t][i] < 0 && l > longest) {
-        longest = l;
-        at = {t, i};
-      }
-    }
-  return at;
-}
-
-/// Bisects chords, no two of them in one triangle; returns how many.
+/// Bisects chords, or rim edges of a rim of three points, no two of them in one triangle.
+///   returns how many
 int splitChordsOnce(TriangleSurface& S) {
-  std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
+  const std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
   const int N = static_cast<int>(S.triangles.size());
   std::vector<char> isRim(S.points.size(), 0), touched(N, 0);
+  int rimEdges = 0, split = 0;
   for (int t = 0; t < N; ++t)
-    for (int i = 0; i < 3; ++i)
-      if (neighbours[t][i] < 0) isRim[S.triangles[t][i]] = isRim[S.triangles[t][(i + 1) % 3]] = 1;
-  int split = 0;
+    for (int i = 0; i < 3; ++i) {
+      if (neighbours[t][i] >= 0) continue;
+      isRim[S.triangles[t][i]] = isRim[S.triangles[t][(i + 1) % 3]] = 1;
+      ++rimEdges;
+    }
   for (int t = 0; t < N; ++t)
     for (int i = 0; i < 3 && !touched[t]; ++i) {
-      int s = neighbours[t][i], a = S.triangles[t][i], b = S.triangles[t][(i + 1) % 3];
-      if (s < 0 || touched[s] || !isRim[a] || !isRim[b]) continue;
-      touched[t] = touched[s] = 1;
-      splitSurfaceEdge(S, neighbours, t, i);
+      const int s = neighbours[t][i], a = S.triangles[t][i], b = S.triangles[t][(i + 1) % 3];
+      const bool isChord = s >= 0 && isRim[a] && isRim[b];
+      if (isChord ? touched[s] : s >= 0 || rimEdges > 3) continue;
+      touched[t] = 1;
+      if (s >= 0) touched[s] = 1;
+      splitSurfaceEdge(S, t, i, s);
       ++split;
     }
   return split;
 }
 
-}  // namespace
-
-void splitChords(TriangleSurface& S) {
-  std::vector<std::vector<int>> rims = rimLoops(S);
-  if (!rims.empty() && rims[0].size() < 4) {  // a single triangle, or three around a point
-    std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S);
-    std::array<int, 2> at = longestRimEdge(S, neighbours);
-    splitSurfaceEdge(S, neighbours, at[0], at[1]);
-  }
-  // A split makes no new chord (its point is inside), so each triangle is visited at most thrice.
-  constexpr int rounds = 8;
-  for (int round = 0; round < rounds && splitChordsOnce(S) > 0; ++round) {
-  }
-}
-
-namespace {
-
-constexpr double piValue = 3.14159265358979323846;
 /// [choice] Window on either side of a rim point over which the rim's turning is measured, of the
 /// rim's length: wider than the noise of real rims, narrower than the sides of all but very thin
-/// surfaces.
-constexpr double cornerWindow = .03;
-/// [choice] A second look over a third of it tells a corner from a strong curve.
-constexpr double narrowWindow = .01;
+/// surfaces. A second look over a third of it tells a sharp corner from a strong curve.
+constexpr double cornerWindow = .03, narrowWindow = .01;
 /// [choice] Least distance of two corners along the rim, of its length; for turns that are not
 /// sharp the second, lest a rounded corner counts twice.
 constexpr double cornerSpacing = .02, weakSpacing = .08;
 /// [choice] Turns that make a corner of 𝓤, and a sharp corner of the geometry (over both windows).
-constexpr double cornerTurn = 30 * piValue / 180;
-constexpr double sharpTurn = 45 * piValue / 180, sharpTurnNarrow = 35 * piValue / 180;
+constexpr double degree = 3.14159265358979323846 / 180;
+constexpr double cornerTurn = 30 * degree, sharpTurn = 45 * degree, sharpTurnNarrow = 35 * degree;
 
-/// Arc length at the points of a closed polyline; one more entry, the length.
-std::vector<double> loopArcLength(const std::vector<Vec3>& points) {
-  std::vector<double> s{0};
-  for (size_t i = 0; i < points.size(); ++i)
-    s.push_back(s.back() + norm(points[(i + 1) % points.size()] - points[i]));
-  return s;
-}
-
-Curve closedCurve(std::vector<Vec3> points) {
+/// A closed curve through these points of x.
+Curve closedCurve(const std::vector<Vec3>& x, const std::vector<int>& loop) {
   Curve C;
-  C.s = loopArcLength(points);
-  C.points = std::move(points);
   C.closed = true;
+  C.s = {0};
+  for (std::size_t i = 0; i < loop.size(); ++i) {
+    C.points.push_back(x[loop[i]]);
+    C.s.push_back(C.s.back() + norm(x[loop[(i + 1) % loop.size()]] - x[loop[i]]));
+  }
   return C;
 }
 
-double periodicArc(double s, double L) { return s - L * std::floor(s / L); }
-
-/// Signed distance along the rim from a to b, in (-L/2, L/2].
-double arcFrom(double a, double b, double L) {
-  double d = periodicArc(b - a, L);
-  return d > L / 2 ? d - L : d;
+/// Distance along a closed curve of length L from arc length a to b > a, in (0, L]; then whichever
+/// way is shorter.
+double arcFrom(double a, double b, double L) { return b > a ? b - a : b - a + L; }
+double arcBetween(double a, double b, double L) {
+  return std::min(std::fabs(b - a), L - std::fabs(b - a));
 }
 
 /// Turn of the rim at arc length s between chords of length w, about `normal`; > 0 where S is
 /// convex.
 double rimTurn(const Curve& rim, double s, double w, Vec3 normal) {
-  Vec3 p = gamma(rim, s), in = p - gamma(rim, s - w), out = gamma(rim, s + w) - p;
+  const Vec3 p = gamma(rim, s);
+  Vec3 in = p - gamma(rim, s - w), out = gamma(rim, s + w) - p;
   in = in - dot(in, normal) * normal;
   out = out - dot(out, normal) * normal;
   return std::atan2(dot(cross(in, out), normal), dot(in, out));
 }
 
-/// Whether no point within cornerSpacing turns more: beside a corner the window still sees a part
-/// of its turn.
-bool isPeak(const std::vector<double>& s, const std::vector<double>& turn, int i) {
-  const int n = static_cast<int>(turn.size());
-  for (int step : {1, n - 1})
-    for (int j = (i + step) % n;
-         j != i && std::fabs(arcFrom(s[i], s[j], s.back())) < cornerSpacing * s.back();
-         j = (j + step) % n)
-      if (turn[j] > turn[i]) return false;
-  return true;
-}
-
-/// The next corner: the strongest peak that is far from the others, else a point near the middle of
-/// the longest arc without a corner.
-int nextCorner(const std::vector<double>& s, const std::vector<double>& turn,
-               const std::vector<int>& chosen) {
+/// The point of the rim nearest to the middle of the longest arc without a corner.
+int middleOfLongestArc(const std::vector<double>& s, std::vector<int> chosen) {
+  std::sort(chosen.begin(), chosen.end());
   const double L = s.back();
-  const int n = static_cast<int>(turn.size());
+  double middle = 0, longest = -1;
+  for (std::size_t c = 0; c < chosen.size(); ++c) {
+    const double from = s[chosen[c]];
+    const double arc = arcFrom(from, s[chosen[(c + 1) % chosen.size()]], L);
+    if (arc <= longest) continue;
+    longest = arc;
+    middle = std::fmod(from + arc / 2, L);
+  }
   int best = -1;
-  for (int i = 0; i < n; ++i) {
-    if (turn[i] < cornerTurn || (best >= 0 && turn[i] <= turn[best])) continue;
-    bool free = true;
-    double spacing = (turn[i] > sharpTurn ? cornerSpacing : weakSpacing) * L;
-    for (int c : chosen) free = free && std::fabs(arcFrom(s[c], s[i], L)) >= spacing;
-    if (free && isPeak(s, turn, i)) best = i;
-  }
-  if (best >= 0) return best;
-  if (chosen.empty())
-    return static_cast<int>(std::max_element(turn.begin(), turn.end()) - turn.begin());
-  double from = 0, longest = -1;
-  for (int c : chosen) {
-    double arc = L;
-    for (int d : chosen)
-      if (d != c) arc = std::min(arc, periodicArc(s[d] - s[c], L));
-    if (arc > longest) {
-      longest = arc;
-      from = s[c];
-    }
-  }
-  double middle = from + longest / 2;
-  for (int i = 0; i < n; ++i) {
+  for (int i = 0; i + 1 < static_cast<int>(s.size()); ++i) {
     if (std::find(chosen.begin(), chosen.end(), i) != chosen.end()) continue;
-    if (best < 0 || std::fabs(arcFrom(middle, s[i], L)) < std::fabs(arcFrom(middle, s[best], L)))
-      best = i;
+    if (best < 0 || arcBetween(middle, s[i], L) < arcBetween(middle, s[best], L)) best = i;
   }
   return best;
 }
 
-std::vector<Vec3> pointsOf(const std::vector<Vec3>& x, const std::vector<int>& nodes) {
-  std::vector<Vec3> points;
-  for (int n : nodes) points.push_back(x[n]);
-  return points;
-}
-
 }  // namespace
+
+void splitChords(TriangleSurface& S) {
+  while (splitChordsOnce(S) > 0) {
+  }  // ends: a chord's new point is inside, so each round leaves fewer chords
+}
 
 RimCorners rimCorners(const SurfaceDistance& S) {
   const int n = static_cast<int>(S.rim.size());
   if (n < 4)
     throw MethodError(
         "rimCorners (§3.6): the rim has fewer than four points; call splitChords() first");
-  Curve rim = closedCurve(pointsOf(S.S.points, S.rim));
+  const Curve rim = closedCurve(S.S.points, S.rim);
   const double L = rim.s.back();
-  std::vector<double> turn(n);
-  for (int i = 0; i < n; ++i)
-    turn[i] = rimTurn(rim, rim.s[i], cornerWindow * L, S.vertexNormal[S.rim[i]]);
-  std::vector<int> chosen;
-  for (int c = 0; c < 4; ++c) chosen.push_back(nextCorner(rim.s, turn, chosen));
+  auto turnAt = [&](int i, double window) {
+    return rimTurn(rim, rim.s[i], window * L, S.vertexNormal[S.rim[i]]);
+  };
+  std::vector<std::pair<double, int>> byTurn;  // strongest first
+  for (int i = 0; i < n; ++i) byTurn.push_back({-turnAt(i, cornerWindow), i});
+  std::sort(byTurn.begin(), byTurn.end());
+  std::vector<int> stronger, chosen;  // a corner is far from all points that turn more
+  auto isFar = [&](const std::vector<int>& points, int i, double spacing) {
+    return std::all_of(points.begin(), points.end(),
+                       [&](int j) { return arcBetween(rim.s[j], rim.s[i], L) >= spacing * L; });
+  };
+  for (const auto& [minusTurn, i] : byTurn) {
+    if (-minusTurn < cornerTurn || chosen.size() == 4) break;
+    const bool isStrong = -minusTurn > sharpTurn || isFar(chosen, i, weakSpacing);
+    if (isStrong && isFar(stronger, i, cornerSpacing)) chosen.push_back(i);
+    stronger.push_back(i);
+  }
+  if (chosen.empty()) chosen.push_back(byTurn[0].second);
+  while (chosen.size() < 4) chosen.push_back(middleOfLongestArc(rim.s, chosen));
   std::sort(chosen.begin(), chosen.end());
 
   RimCorners corners{};
   for (int c = 0; c < 4; ++c) {
-    int i = chosen[c];
-    double narrow = rimTurn(rim, rim.s[i], narrowWindow * L, S.vertexNormal[S.rim[i]]);
-    corners.at[c] = i;
-    corners.sharp[c] = turn[i] > sharpTurn && narrow > sharpTurnNarrow;
+    const int i = corners.at[c] = chosen[c];
+    corners.sharp[c] =
+        turnAt(i, cornerWindow) > sharpTurn && turnAt(i, narrowWindow) > sharpTurnNarrow;
   }
   return corners;
 }
 
 namespace {
 
-/// The point of the boundary of 𝓤 on side 0 .. 3 at the fraction t of the side; on it exactly.
-Vec2 onSide(int side, double t) {
-  switch (side) {
-    case 0:
-      return {t, 0};
-    case 1:
-      return {1, t};
-    case 2:
-      return {1 - t, 1};
-    default:
-      return {0, 1 - t};
-  }
-}
-
 /// Arcs of a closed curve from corner to corner go to the sides of 𝓤 by arc length; s in [0, L).
 Vec2 rimParameter(const std::array<double, 4>& cornerS, double L, double s) {
-  int side = s < cornerS[1] ? 0 : s < cornerS[2] ? 1 : s < cornerS[3] ? 2 : 3;
-  double from = cornerS[side], to = side < 3 ? cornerS[side + 1] : L;
-  return onSide(side, std::min(std::max((s - from) / (to - from), 0.0), 1.0));
+  const int side = s < cornerS[1] ? 0 : s < cornerS[2] ? 1 : s < cornerS[3] ? 2 : 3;
+  const double from = cornerS[side], to = side < 3 ? cornerS[side + 1] : L;
+  const double t = std::clamp((s - from) / (to - from), 0.0, 1.0);
+  return std::array<Vec2, 4>{{{t, 0}, {1, t}, {1 - t, 1}, {0, 1 - t}}}[side];
 }
 
 }  // namespace
 
 SurfaceParametrization parametrizeSurface(const SurfaceDistance& S) {
-  RimCorners corners = rimCorners(S);
+  const RimCorners corners = rimCorners(S);
   std::vector<int> loop = S.rim;
   std::rotate(loop.begin(), loop.begin() + corners.at[0], loop.end());
   SurfaceParametrization Phi;
-  Phi.rim = closedCurve(pointsOf(S.S.points, loop));
+  Phi.rim = closedCurve(S.S.points, loop);
   Phi.sharp = corners.sharp;
   for (int c = 0; c < 4; ++c) Phi.cornerS[c] = Phi.rim.s[corners.at[c] - corners.at[0]];
 
   std::vector<Vec2> u(S.S.points.size()), uRim;
-  for (size_t i = 0; i < loop.size(); ++i) {
+  for (std::size_t i = 0; i < loop.size(); ++i) {
     uRim.push_back(rimParameter(Phi.cornerS, Phi.rim.s.back(), Phi.rim.s[i]));
     u[loop[i]] = uRim.back();
   }
@@ -2959,7 +2664,8 @@ struct ApproximatingSurface {
   double h = 0;             // mean length of its edges
 };
 
-ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDistance& S) {
+/// The faces labelled k with their own numbers, oriented consistently.
+ApproximatingSurface labelledSurface(const Mesh& M, int k) {
   ApproximatingSurface SM;
   std::vector<int> number(M.x.size(), -1);
   for (std::array<int, 3> f : surfaceFaces(M, k)) {
@@ -2973,27 +2679,25 @@ ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDis
     }
     SM.S.triangles.push_back(f);
   }
-  auto refuseSM = [&](const std::string& what) {
-    throw MethodError("insertSurface (§3.6): S_M " + what + "; lower l_c");
-  };
   if (SM.S.triangles.empty()) refuseSM("of surface " + std::to_string(k) + " has no face");
-  std::vector<std::array<int, 3>> neighbours = triangleNeighbours(SM.S);
-  int turned = 0;
-  std::array<int, 2> at{0, 0};
-  if (componentSizes(neighbours).size() != 1 || !orientConsistently(SM.S, neighbours, turned, at))
+  const std::vector<std::array<int, 3>> neighbours = triangleNeighbours(SM.S);
+  if (componentSizes(neighbours).size() != 1 || orientConsistently(SM.S, neighbours) < 0)
     refuseSM("is not one orientable piece");
+  return SM;
+}
 
+ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDistance& S) {
+  ApproximatingSurface SM = labelledSurface(M, k);
   // The side of S's normals: by the nearest points of S, weighted by area.
   double agreement = 0;
   for (const std::array<int, 3>& t : SM.S.triangles) {
-    Vec3 a = SM.S.points[t[0]], b = SM.S.points[t[1]], c = SM.S.points[t[2]];
-    agreement += dot(cross(b - a, c - a), S.query((1.0 / 3) * (a + b + c)).normal);
-    SM.h += (norm(b - a) + norm(c - b) + norm(a - c)) /
-            (3 * static_cast<double>(SM.S.triangles.size()));
+    const Vec3 a = SM.S.points[t[0]], b = SM.S.points[t[1]], c = SM.S.points[t[2]];
+    agreement += dot(cross(b - a, c - a), S.query((1. / 3) * (a + b + c)).normal);
+    SM.h += (norm(b - a) + norm(c - b) + norm(a - c)) / (3 * double(SM.S.triangles.size()));
   }
   if (agreement < 0)
     for (std::array<int, 3>& t : SM.S.triangles) std::swap(t[1], t[2]);
-  std::vector<std::vector<int>> rims = rimLoops(SM.S);
+  const std::vector<std::vector<int>> rims = rimLoops(SM.S);
   if (rims.size() != 1) refuseSM("has " + std::to_string(rims.size()) + " rims instead of one");
   if (rims[0].size() < 4) refuseSM("has only " + std::to_string(rims[0].size()) + " rim nodes");
   SM.rim = rims[0];
@@ -3002,66 +2706,96 @@ ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDis
   return SM;
 }
 
-/// Turns of S_M's rim at its nodes, > 0 where convex: π less the angles of its triangles there, so that
-/// a fold of S_M is no turn. [rim]
-std::vector<double> approximateTurns(const ApproximatingSurface& SM) {
-  constexpr double pi = 3.14159265358979323846;
-  std::vector<double> turn(SM.S.points.size(), pi);
-  for (const std::array<int, 3>& t : SM.S.triangles)
-    for (int i = 0; i < 3; ++i) {
-      const Vec3 p = SM.S.points[t[i]];
-      const Vec3 a = SM.S.points[t[(i + 1) % 3]] - p, b = SM.S.points[t[(i + 2) % 3]] - p;
-      turn[t[i]] -= std::atan2(norm(cross(a, b)), dot(a, b));
-    }
-  std::vector<double> ofRim;
-  for (int n : SM.rim) ofRim.push_back(turn[n]);
-  return ofRim;
+/// The rim nodes of S_M matched to the four corners of S in cyclic order, with the least sum of
+/// squared distances less bonus: for each partner of the first, dynamic programming over the
+/// others.
+std::array<int, 4> matchedCorners(const std::vector<Vec3>& rim, const RealVector& bonus,
+                                  const std::array<Vec3, 4>& corners) {
+  const int m = static_cast<int>(rim.size());
+  auto cost = [&](int i, int c) { return norm2(rim[i] - corners[c]) - bonus[i]; };
+  std::array<int, 4> best{};
+  double least = beyondAll;
+  for (int first = 0; first < m; ++first) {
+    // sum[c] is the least cost of corners 0 .. c placed so far, at[c] are their places
+    std::array<double, 4> sum{cost(first, 0), beyondAll, beyondAll, beyondAll};
+    std::array<std::array<int, 4>, 4> at{};
+    at[0][0] = first;
+    for (int i = (first + 1) % m; i != first; i = (i + 1) % m)
+      for (int c = 3; c >= 1; --c) {
+        const double with = sum[c - 1] + cost(i, c);
+        if (with >= sum[c] || sum[c - 1] >= beyondAll) continue;
+        sum[c] = with;
+        at[c] = at[c - 1];
+        at[c][c] = i;
+      }
+    if (sum[3] >= least) continue;
+    least = sum[3];
+    best = at[3];
+  }
+  return best;
 }
 
 /// [choice] What a convex rim node of S_M (a turn above 45 degrees) is worth as partner of a corner
-/// of S, in squared distances over h².
+/// of S, against squared distances over h².
 constexpr double convexBonus = 1;
 /// [choice] A corner holds no node that is farther away than this, in h: it would only trap
 /// inverted elements.
 constexpr double cornerReach = 2;
+/// [choice] Weights of the correspondence of the rims, against squared distances over h²: 1 −
+/// cosine of the two tangents, and (step on S / wanted step − 1)². Least and longest step, of the
+/// wanted.
+constexpr double tangentWeight = .5, stepWeight = .25, leastStep = .25, longestStep = 4;
+/// [choice] Samples of S's rim per h, and per rim node of S_M at least: leastStep needs 3.
+constexpr int samplesPerH = 6, samplesPerNode = 3;
 
-double cornerCost(const ApproximatingSurface& SM, const std::vector<double>& turn, int i,
-                  Vec3 corner) {
-  double d2 = norm2(SM.S.points[SM.rim[i]] - corner) / (SM.h * SM.h);
-  return d2 - (turn[i] > sharpTurn ? convexBonus : 0);
-}
+/// A stretch of both rims between two pinned nodes.
+struct RimArc {
+  int first;                   // position in S_M's rim
+  double from, length;         // on S's rim
+  std::vector<double> wanted;  // [edges of S_M], their lengths, scaled to the sum `length`
+};
 
-/// [§3.6, followRim = false] The rim nodes matched to the four corners in cyclic order, with the
-/// least sum of costs: for each partner of the first corner, dynamic programming over the other
-/// three.
-std::array<int, 4> matchedCorners(const ApproximatingSurface& SM,
-                                  const std::array<Vec3, 4>& corners) {
-  const int m = static_cast<int>(SM.rim.size());
-  std::vector<double> turn = approximateTurns(SM);
-  std::array<RealVector, 4> cost;
-  for (int c = 0; c < 4; ++c)
-    for (int i = 0; i < m; ++i) cost[c].push_back(cornerCost(SM, turn, i, corners[c]));
-  std::array<int, 4> best{0, 1, 2, 3};
-  double least = beyondAll;
-  for (int first = 0; first < m; ++first) {
-    // sum[c] is the least cost of corners 1 .. c placed so far, at[c] are their places
-    std::array<double, 4> sum{cost[0][first], beyondAll, beyondAll, beyondAll};
-    std::array<std::array<int, 4>, 4> at{};
-    at[0][0] = first;
-    for (int step = 1; step < m; ++step)
-      for (int c = 3; c >= 1; --c) {
-        int i = (first + step) % m;
-        if (sum[c - 1] >= beyondAll || sum[c - 1] + cost[c][i] >= sum[c]) continue;
-        sum[c] = sum[c - 1] + cost[c][i];
-        at[c] = at[c - 1];
-        at[c][c] = i;
-      }
-    if (sum[3] < least) {
-      least = sum[3];
-      best = at[3];
+/// [§3.6 departure] The samples of S's rim, of `count` on the arc, that the nodes at the ends of
+/// the arc's edges go to: dynamic programming from edge to edge; the last node goes to the last
+/// sample.
+std::vector<int> followArc(const Curve& rim, const Curve& rimM, double h, const RimArc& arc,
+                           int count) {
+  const int edges = static_cast<int>(arc.wanted.size()), m = static_cast<int>(rimM.points.size());
+  const double ds = arc.length / count;
+  std::vector<Vec3> at, tangent;  // [samples + 1]
+  for (int k = 0; k <= count; ++k) {
+    const double s = arc.from + k * ds;
+    at.push_back(gamma(rim, s));
+    tangent.push_back(unitVector(gamma(rim, s + h / 2) - gamma(rim, s - h / 2)));
+  }
+  // least[k]: cost of the nodes so far with the last at sample k; step[e][k]: its step, 0: none
+  RealVector least(count + 1, beyondAll), before, stepCost;
+  std::vector<std::vector<std::uint16_t>> step(edges, std::vector<std::uint16_t>(count + 1, 0));
+  least[0] = 0;
+  for (int e = 0; e < edges; ++e) {
+    const double wanted = arc.wanted[e] / ds;  // in samples
+    const int lo = std::max(1, static_cast<int>(leastStep * wanted));
+    const int hi = static_cast<int>(std::min(longestStep * wanted + 1, 65535.));
+    stepCost.assign(hi + 1, 0);
+    for (int g = lo; g <= hi; ++g) stepCost[g] = stepWeight * (g / wanted - 1) * (g / wanted - 1);
+    before.assign(count + 1, beyondAll);
+    before.swap(least);
+    const int i = (arc.first + e + 1) % m;
+    const Vec3 x = rimM.points[i];
+    const Vec3 tangentM = unitVector(rimM.points[(i + 1) % m] - rimM.points[(i + m - 1) % m]);
+    for (int k = lo; k <= count; ++k) {
+      for (int g = lo; g <= std::min(hi, k); ++g)
+        if (before[k - g] + stepCost[g] < least[k]) {
+          least[k] = before[k - g] + stepCost[g];
+          step[e][k] = static_cast<std::uint16_t>(g);
+        }
+      if (least[k] < beyondAll)
+        least[k] += norm2(x - at[k]) / (h * h) + tangentWeight * (1 - dot(tangentM, tangent[k]));
     }
   }
-  return best;
+  std::vector<int> sample(edges, count);
+  for (int e = edges - 1; e > 0; --e) sample[e - 1] = sample[e] - step[e][sample[e]];
+  return sample;
 }
 
 /// Where the rim nodes of S_M go: arc length on S's rim, and the corner held (-1: none). [rim]
@@ -3070,373 +2804,118 @@ struct RimTargets {
   std::vector<int> corner;
 };
 
-std::array<Vec3, 4> cornerPoints(const SurfaceParametrization& Phi) {
-  std::array<Vec3, 4> x;
-  for (int c = 0; c < 4; ++c) x[c] = gamma(Phi.rim, Phi.cornerS[c]);
-  return x;
+/// The pair of a rim node of S_M and a point of S's rim that are nearest.
+std::pair<int, double> nearestPair(const std::vector<Vec3>& rimM, const Curve& rim, double h) {
+  std::pair<int, double> best{0, 0};
+  double least = beyondAll;
+  for (double s = 0; s < rim.s.back(); s += h / samplesPerH) {
+    const Vec3 p = gamma(rim, s);
+    for (std::size_t i = 0; i < rimM.size(); ++i) {
+      if (norm2(rimM[i] - p) >= least) continue;
+      least = norm2(rimM[i] - p);
+      best = {static_cast<int>(i), s};
+    }
+  }
+  return best;
 }
 
-/// [§3.6, followRim = false] Both rims by arc length between the four corners.
-RimTargets targetsByArcLength(const ApproximatingSurface& SM, const SurfaceParametrization& Phi) {
+/// The bonus of S_M's rim nodes as partners of corners, squared length unit. Their turn is π less
+/// the angles of their triangles, so that a fold of S_M is no turn. [rim]
+RealVector cornerBonus(const ApproximatingSurface& SM) {
+  RealVector turn(SM.S.points.size(), 180 * degree), bonus;
+  for (const std::array<int, 3>& t : SM.S.triangles)
+    for (int i = 0; i < 3; ++i) {
+      const Vec3 p = SM.S.points[t[i]];
+      const Vec3 a = SM.S.points[t[(i + 1) % 3]] - p, b = SM.S.points[t[(i + 2) % 3]] - p;
+      turn[t[i]] -= std::atan2(norm(cross(a, b)), dot(a, b));
+    }
+  for (int n : SM.rim) bonus.push_back(turn[n] > sharpTurn ? convexBonus * SM.h * SM.h : 0);
+  return bonus;
+}
+
+/// Where the rim goes between pinned nodes, the corners: by arc length, or [§3.6 departure]
+/// following the nearest rim of S, pinned at sharp corners in reach only (where there is none, at
+/// one node).
+RimTargets rimTargets(const ApproximatingSurface& SM, const SurfaceParametrization& Phi,
+                      bool followRim) {
   const int m = static_cast<int>(SM.rim.size());
   const double L = Phi.rim.s.back();
-  std::array<Vec3, 4> corners = cornerPoints(Phi);
-  std::array<int, 4> at = matchedCorners(SM, corners);
+  const Curve rimM = closedCurve(SM.S.points, SM.rim);
+  std::array<Vec3, 4> corners;
+  for (int c = 0; c < 4; ++c) corners[c] = gamma(Phi.rim, Phi.cornerS[c]);
+  const std::array<int, 4> at = matchedCorners(rimM.points, cornerBonus(SM), corners);
+
   RimTargets targets{std::vector<double>(m), std::vector<int>(m, -1)};
+  std::vector<std::pair<int, double>> pins;  // position in S_M's rim, arc length on S's
   for (int c = 0; c < 4; ++c) {
-    std::vector<double> along{0};
-    int steps = (at[(c + 1) % 4] - at[c] + m) % m;
-    for (int j = 0; j < steps; ++j) {
-      int a = SM.rim[(at[c] + j) % m], b = SM.rim[(at[c] + j + 1) % m];
-      along.push_back(along.back() + norm(SM.S.points[b] - SM.S.points[a]));
+    const bool isHeld = Phi.sharp[c] && norm(rimM.points[at[c]] - corners[c]) <= cornerReach * SM.h;
+    if (isHeld) targets.corner[at[c]] = c;
+    if (isHeld || !followRim) pins.push_back({at[c], Phi.cornerS[c]});
+  }
+  if (pins.empty()) pins.push_back(nearestPair(rimM.points, Phi.rim, SM.h));
+  for (std::size_t j = 0; j < pins.size(); ++j) {
+    const auto [first, from] = pins[j];
+    const auto [last, to] = pins[(j + 1) % pins.size()];
+    RimArc arc{first, from, arcFrom(from, to, L), {}};
+    const double scale = arc.length / arcFrom(rimM.s[first], rimM.s[last], rimM.s.back());
+    for (int i = first; i != last || arc.wanted.empty(); i = (i + 1) % m)
+      arc.wanted.push_back(scale * (rimM.s[i + 1] - rimM.s[i]));
+    const int edges = static_cast<int>(arc.wanted.size());
+    const int count =
+        std::max(samplesPerNode * edges, static_cast<int>(samplesPerH * arc.length / SM.h));
+    std::vector<int> sample;
+    if (followRim) sample = followArc(Phi.rim, rimM, SM.h, arc, count);
+    double s = from;
+    for (int e = 0; e < edges; ++e) {
+      targets.s[(first + e) % m] = s < L ? s : s - L;
+      s = followRim ? from + sample[e] * (arc.length / count) : s + arc.wanted[e];
     }
-    double from = Phi.cornerS[c], to = c < 3 ? Phi.cornerS[c + 1] : L;
-    for (int j = 0; j < steps; ++j)
-      targets.s[(at[c] + j) % m] = from + (to - from) * along[j] / along.back();
-    bool near = norm(SM.S.points[SM.rim[at[c]]] - corners[c]) <= cornerReach * SM.h;
-    if (Phi.sharp[c] && near) targets.corner[at[c]] = c;
   }
   return targets;
 }
 
-// ---- The rim of S_M follows the nearest rim of S [§3.6 departure] ------------------------------
-
-/// [choice] Weights of the correspondence, against squared distances over h²: 1 − cosine of the two
-/// tangents, and (step on S / step on S_M − 1)². Samples of S's rim per h.
-constexpr double tangentWeight = .5, stepWeight = .25;
-constexpr int samplesPerH = 6, samplesPerNode = 3;
-constexpr double maxTableSize = 4e7;  // entries of the back pointers; fewer samples beyond
-
-/// The rim of S sampled, and the rim of S_M.
-struct RimProblem {
-  double ds;                        // step of the samples
-  std::vector<Vec3> at, direction;  // [samples]
-  std::vector<Vec3> x, tangent;     // [rim nodes]
-  std::vector<double>
-      step;  // [rim nodes], wanted step from node i to the next: its share of S's rim
-  double h;
-  double cost(int i, int k) const {
-    return norm2(x[i] - at[k]) / (h * h) + tangentWeight * (1 - dot(tangent[i], direction[k]));
-  }
-};
-
-RimProblem rimProblem(const ApproximatingSurface& SM, const Curve& rim) {
-  const int m = static_cast<int>(SM.rim.size());
-  const double L = rim.s.back();
-  RimProblem R;
-  R.h = SM.h;
-  int K = std::max(samplesPerNode * m,
-                   static_cast<int>(std::min(std::ceil(samplesPerH * L / SM.h), 1e7)));
-  K = std::max(2 * m, std::min(K, static_cast<int>(maxTableSize / m)));
-  R.ds = L / K;
-  for (int k = 0; k < K; ++k) {
-    R.at.push_back(gamma(rim, k * R.ds));
-    R.direction.push_back(
-        unitVector(gamma(rim, k * R.ds + SM.h / 2) - gamma(rim, k * R.ds - SM.h / 2)));
-  }
-  R.x = pointsOf(SM.S.points, SM.rim);
-  std::vector<double> s = loopArcLength(R.x);
-  for (int i = 0; i < m; ++i) {
-    R.tangent.push_back(unitVector(R.x[(i + 1) % m] - R.x[(i + m - 1) % m]));
-    R.step.push_back((s[i + 1] - s[i]) * L / s.back());
-  }
-  return R;
-}
-
-/// Cost of a step of length g where `wanted` is wanted: quadratic up to three times as long, then
-/// linear.
-constexpr double longStep = 3;
-double stepCost(double g, double wanted) {
-  double r = g / wanted - 1, bend = longStep - 1;
-  return stepWeight * (r <= bend ? r * r : bend * bend + 2 * bend * (r - bend));
-}
-
-/// One layer of the dynamic program: D[k] = cost + min over j < k of D'[j] + stepCost, from[k] the
-/// best j. The linear part of the step cost needs only a running minimum.
-void relaxLayer(const RimProblem& R, int node, double wanted, int origin, int kFirst, int kLast,
-                const RealVector& before, RealVector& D, int* from) {
-  const int K = static_cast<int>(R.at.size());
-  const int window = static_cast<int>(longStep * wanted / R.ds) + 1;
-  const double slope = stepWeight * 2 * (longStep - 1) * R.ds / wanted;
-  RealVector step(window + 1);
-  for (int g = 1; g <= window; ++g) step[g] = stepCost(g * R.ds, wanted);
-  std::fill(D.begin(), D.end(), beyondAll);
-  double farBest = beyondAll;  // least D'[j] − slope j over j < k − window
-  int farFrom = -1, farNext = 0;
-  for (int k = kFirst; k <= kLast; ++k) {
-    for (; farNext < k - window; ++farNext)
-      if (before[farNext] < beyondAll && before[farNext] - slope * farNext < farBest) {
-        farBest = before[farNext] - slope * farNext;
-        farFrom = farNext;
-      }
-    double least = beyondAll;
-    if (farFrom >= 0) {
-      least = farBest + slope * farFrom + stepCost((k - farFrom) * R.ds, wanted);
-      from[k] = farFrom;
-    }
-    for (int g = 1; g <= window && g <= k; ++g)
-      if (before[k - g] + step[g] < least) {
-        least = before[k - g] + step[g];
-        from[k] = k - g;
-      }
-    if (least < beyondAll) D[k] = least + R.cost(node, (origin + k) % K);
-  }
-}
-
-/// The cheapest cyclic assignment of nodes to samples, strictly ascending, with node `pinned` at
-/// sample `origin`: offsets from the origin. [rim nodes], starting with the pinned one
-std::vector<int> assignSamples(const RimProblem& R, int pinned, int origin) {
-  const int m = static_cast<int>(R.x.size()), K = static_cast<int>(R.at.size());
-  std::vector<int> from(static_cast<size_t>(m) * K, -1);
-  RealVector before(K, beyondAll), D(K, beyondAll);
-  before[0] = 0;
-  for (int j = 1; j < m; ++j) {
-    double wanted = R.step[(pinned + j - 1) % m];
-    relaxLayer(R, (pinned + j) % m, wanted, origin, j, K - m + j, before, D,
-               &from[static_cast<size_t>(j) * K]);
-    std::swap(before, D);
-  }
-  int last = m - 1;
-  double least = beyondAll;
-  for (int k = m - 1; k < K; ++k) {
-    double total = before[k] + stepCost((K - k) * R.ds, R.step[(pinned + m - 1) % m]);
-    if (total < least) {
-      least = total;
-      last = k;
-    }
-  }
-  std::vector<int> offset(m);
-  for (int j = m - 1; j >= 0; --j) {
-    offset[j] = last;
-    last = from[static_cast<size_t>(j) * K + last];
-  }
-  return offset;
-}
-
-/// The correspondence of the rims: s of each rim node. Two passes, the second pinned where the
-/// first had the most freedom, opposite to the first pin.
-std::vector<double> followedRim(const RimProblem& R) {
-  const int m = static_cast<int>(R.x.size()), K = static_cast<int>(R.at.size());
-  int pinned = 0, origin = 0;
-  double least = beyondAll;
-  for (int i = 0; i < m; ++i)
-    for (int k = 0; k < K; ++k)
-      if (R.cost(i, k) < least) {
-        least = R.cost(i, k);
-        pinned = i;
-        origin = k;
-      }
-  std::vector<int> offset = assignSamples(R, pinned, origin);
-  origin = (origin + offset[m / 2]) % K;
-  pinned = (pinned + m / 2) % m;
-  offset = assignSamples(R, pinned, origin);
-  std::vector<double> s(m);
-  for (int j = 0; j < m; ++j) s[(pinned + j) % m] = R.ds * ((origin + offset[j]) % K);
-  return s;
-}
-
-/// The ascending sequence nearest to `wanted` (least squares) with steps of at least gap[j] inside
-/// [from, to]: isotonic regression by pooling of adjacent violators. gap has one entry more than
-/// wanted, Σ gap <= to − from.
-std::vector<double> spreadApart(const std::vector<double>& wanted, const std::vector<double>& gap,
-                                double from, double to) {
-  struct Pool {
-    double sum;
-    int count;
-  };
-  std::vector<Pool> pools;
-  double before = 0, all = 0;
-  for (double g : gap) all += g;
-  for (size_t j = 0; j < wanted.size(); ++j) {
-    before += gap[j];
-    pools.push_back({wanted[j] - before, 1});
-    while (pools.size() > 1) {
-      Pool &a = pools[pools.size() - 2], &b = pools.back();
-      if (a.sum / a.count <= b.sum / b.count) break;
-      a = {a.sum + b.sum, a.count + b.count};
-      pools.pop_back();
-    }
-  }
-  std::vector<double> s;
-  before = 0;
-  for (const Pool& p : pools)
-    for (int i = 0; i < p.count; ++i) {
-      before += gap[s.size()];
-      s.push_back(std::min(std::max(p.sum / p.count, from), to - all) + before);
-    }
-  return s;
-}
-
-/// Releases corners, the farthest node first, until those held follow each other as on S's rim.
-void keepCyclicOrder(const ApproximatingSurface& SM, const std::array<Vec3, 4>& corners,
-                     std::vector<int>& corner) {
-  for (int round = 0; round < 4; ++round) {
-    std::vector<int> held;
-    int farthest = -1, descents = 0;
-    double largest = -1;
-    for (int i = 0; i < static_cast<int>(corner.size()); ++i) {
-      if (corner[i] < 0) continue;
-      held.push_back(corner[i]);
-      double d = norm(SM.S.points[SM.rim[i]] - corners[corner[i]]);
-      if (d > largest) {
-        largest = d;
-        farthest = i;
-      }
-    }
-    for (size_t j = 0; j < held.size(); ++j)
-      descents += held[(j + 1) % held.size()] < held[j] ? 1 : 0;
-    if (descents <= 1) return;
-    corner[farthest] = -1;
-  }
-}
-
-/// Holds rim nodes at sharp corners: the cheapest one in reach whose place in the cyclic order is
-/// right.
-std::vector<int> heldCorners(const ApproximatingSurface& SM, const SurfaceParametrization& Phi,
-                             const std::vector<double>& s) {
-  const int m = static_cast<int>(SM.rim.size());
-  const double L = Phi.rim.s.back(), reach = cornerReach * SM.h;
-  std::array<Vec3, 4> corners = cornerPoints(Phi);
-  std::vector<double> turn = approximateTurns(SM);
-  std::vector<int> corner(m, -1);
-  for (int c = 0; c < 4; ++c) {
-    int best = -1;
-    double least = beyondAll;
-    for (int i = 0; i < m && Phi.sharp[c]; ++i) {
-      double arc = arcFrom(Phi.cornerS[c], s[i], L);
-      if (corner[i] >= 0 || norm(SM.S.points[SM.rim[i]] - corners[c]) > reach ||
-          std::fabs(arc) > reach)
-        continue;
-      double cost = cornerCost(SM, turn, i, corners[c]) + arc * arc / (SM.h * SM.h);
-      if (cost < least) {
-        least = cost;
-        best = i;
-      }
-    }
-    if (best >= 0) corner[best] = c;
-  }
-  keepCyclicOrder(SM, corners, corner);
-  return corner;
-}
-
-/// [choice] Least step between rim nodes, of the step their edge on S_M asks for.
-constexpr double leastStep = .25;
-
-/// Moves the nodes between two held ones (positions a < b <= a + m in the loop) apart, from s[a] to
-/// s[a] + arc.
-void spreadArc(const RimProblem& R, int a, int b, double arc, double L, std::vector<double>& s) {
-  const int m = static_cast<int>(s.size());
-  std::vector<double> wanted, gap;
-  double from = s[a % m], sum = 0;
-  for (int i = a; i < b; ++i) {
-    gap.push_back(leastStep * R.step[i % m]);
-    sum += gap.back();
-    if (i > a)
-      wanted.push_back(std::min(
-          std::max(from + arc / 2 + arcFrom(from + arc / 2, s[i % m], L), from), from + arc));
-  }
-  for (double& g : gap) g *= std::min(1.0, .5 * arc / sum);
-  std::vector<double> placed = spreadApart(wanted, gap, from, from + arc);
-  for (int i = a + 1; i < b; ++i) s[i % m] = periodicArc(placed[i - a - 1], L);
-}
-
-/// [§3.6 departure] S_M's rim follows the nearest rim of S.
-RimTargets targetsFollowingRim(const ApproximatingSurface& SM, const SurfaceParametrization& Phi) {
-  const int m = static_cast<int>(SM.rim.size());
-  const double L = Phi.rim.s.back();
-  RimProblem R = rimProblem(SM, Phi.rim);
-  RimTargets targets{followedRim(R), {}};
-  targets.corner = heldCorners(SM, Phi, targets.s);
-  std::vector<int> held;
-  for (int i = 0; i < m; ++i)
-    if (targets.corner[i] >= 0) {
-      held.push_back(i);
-      targets.s[i] = Phi.cornerS[targets.corner[i]];
-    }
-  if (held.empty()) held.push_back(0);
-  for (size_t j = 0; j < held.size(); ++j) {
-    int a = held[j], b = j + 1 < held.size() ? held[j + 1] : held[0] + m;
-    double arc = held.size() == 1 ? L : periodicArc(targets.s[b % m] - targets.s[a], L);
-    spreadArc(R, a, b, arc, L, targets.s);
-  }
-  return targets;
-}
-
-// ---- Anchors and the map -----------------------------------------------------------------------
-
-/// [choice] μ of the anchored equations, and its factor where a triangle folds, before it becomes
-/// 0.
+/// [choice] μ of the anchored equations, and its factor where a triangle folds.
 constexpr double anchorMu = .3, foldedFactor = .2;
-constexpr int maxAnchorRounds = 24;
+/// Rings of triangles around folded ones that lose their anchors: 0, 1, 3, 7 ... up to this.
+constexpr int maxRings = 63;
 
-/// ϕ⁻¹ of the nearest point of S, and its weight. [points of S_M]
-struct Anchors {
-  std::vector<Vec2> u;
-  std::vector<double> mu;
-};
-Anchors anchorsOf(const ApproximatingSurface& SM, const SurfaceDistance& S,
-                  const std::vector<Vec2>& uS) {
-  Anchors A{std::vector<Vec2>(SM.node.size()), std::vector<double>(SM.node.size(), 0.0)};
-  for (size_t i = 0; i < SM.node.size(); ++i) {
-    if (SM.isRim[i]) continue;
-    SurfaceQuery q = S.query(SM.S.points[i]);
-    const std::array<int, 3>& t = S.S.triangles[q.triangle];
-    A.u[i] = q.w[0] * uS[t[0]] + q.w[1] * uS[t[1]] + q.w[2] * uS[t[2]];
-    A.mu[i] = q.onRim ? 0 : anchorMu;
-  }
-  return A;
-}
-
-/// Marks the points of the triangles and `rings` rings of triangles around them.
-std::vector<char> pointsAround(const TriangleSurface& S, const std::vector<int>& triangles,
-                               int rings) {
+/// Takes the anchors of the points of the triangles and of `rings` rings of triangles around away.
+void releaseAnchors(const TriangleSurface& S, const std::vector<int>& triangles, int rings,
+                    std::vector<double>& mu) {
   std::vector<char> marked(S.points.size(), 0);
   for (int t : triangles)
     for (int n : S.triangles[t]) marked[n] = 1;
   for (int ring = 0; ring < rings; ++ring) {
-    std::vector<char> next = marked;
+    const std::vector<char> before = marked;
     for (const std::array<int, 3>& t : S.triangles)
-      if (marked[t[0]] || marked[t[1]] || marked[t[2]]) next[t[0]] = next[t[1]] = next[t[2]] = 1;
-    marked = std::move(next);
+      if (before[t[0]] || before[t[1]] || before[t[2]])
+        for (int n : t) marked[n] = 1;
   }
-  return marked;
+  for (std::size_t i = 0; i < mu.size(); ++i)
+    if (marked[i]) mu[i] *= foldedFactor;
 }
 
-/// [§3.6 departure] ϕ_M⁻¹ with anchors; where triangles fold the anchors go, in growing rings,
-/// until none folds.
-std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, Anchors A, std::vector<Vec2> u,
-                              ProjectionReport& report) {
-  SparseMatrix lambda = meanValueWeights(SM.S.points, SM.S.triangles, SM.isRim);
-  std::vector<char> weakened(SM.node.size(), 0);
-  for (size_t i = 0; i < u.size(); ++i)
-    if (!SM.isRim[i]) u[i] = A.u[i];
-  for (int round = 1; round <= maxAnchorRounds; ++round) {
-    u = anchoredParametrization(lambda, SM.isRim, u, A.mu, A.u);
-    report.rounds = round;
-    std::vector<int> flipped = flippedTriangles(SM.S.triangles, u);
-    if (round == 1) report.flipped = static_cast<int>(flipped.size());
+/// [§3.6 departure] ϕ_M⁻¹ anchored at ϕ⁻¹ of the nearest points of S; where triangles fold the
+/// anchors go, in growing rings, until none folds.
+///   u  set at the rim
+std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDistance& S,
+                              const std::vector<Vec2>& uS, std::vector<Vec2> u) {
+  std::vector<double> mu(u.size(), 0.0);
+  for (std::size_t i = 0; i < u.size(); ++i) {
+    if (SM.isRim[i]) continue;
+    const SurfaceQuery q = S.query(SM.S.points[i]);
+    const std::array<int, 3>& t = S.S.triangles[q.triangle];
+    u[i] = q.w[0] * uS[t[0]] + q.w[1] * uS[t[1]] + q.w[2] * uS[t[2]];
+    mu[i] = q.onRim ? 0 : anchorMu;
+  }
+  const SparseMatrix lambda = meanValueWeights(SM.S.points, SM.S.triangles, SM.isRim);
+  const std::vector<Vec2> anchor = u;
+  for (int rings = 0; rings <= maxRings; rings = 2 * rings + 1) {
+    u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor);
+    const std::vector<int> flipped = flippedTriangles(SM.S.triangles, u);
     if (flipped.empty()) return u;
-    // Rounds 1 and 2 touch the folded triangles only, then one more ring in each.
-    std::vector<char> around = pointsAround(SM.S, flipped, std::max(0, round - 2));
-    for (size_t i = 0; i < around.size(); ++i)
-      if (around[i]) {
-        A.mu[i] = weakened[i] || round > 2 ? 0 : foldedFactor * A.mu[i];
-        weakened[i] = 1;
-      }
+    releaseAnchors(SM.S, flipped, rings, mu);
   }
-  return floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
-}
-
-/// [§3.6, eq. (3)] ϕ_M⁻¹ of all points of S_M.
-std::vector<Vec2> approximateParameters(const ApproximatingSurface& SM, const SurfaceDistance& S,
-                                        const SurfaceParametrization& Phi,
-                                        const RimTargets& targets, bool followRim,
-                                        ProjectionReport& report) {
-  std::vector<Vec2> u(SM.node.size());
-  for (size_t i = 0; i < SM.rim.size(); ++i)
-    u[SM.rim[i]] = rimParameter(Phi.cornerS, Phi.rim.s.back(), targets.s[i]);
-  if (followRim) return anchoredMap(SM, anchorsOf(SM, S, Phi.surface.u), u, report);
-  report.rounds = 1;
   return floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
 }
 
@@ -3449,56 +2928,55 @@ void placeNode(Mesh& M, int n, int dimension, int entity, Vec2 parameter, Vec3 x
 }
 
 /// [§3.6, eq. (4)] x' = ϕ(ϕ_M⁻¹(x)) inside, γ(s) on the rim, the corner itself where one is held.
-void placeNodes(Mesh& M, int k, int curve, const ApproximatingSurface& SM,
-                const SurfaceParametrization& Phi, const RimTargets& targets,
-                const std::vector<Vec2>& u, ProjectionReport& report) {
-  const Parametrization& surface = M.surfaces[k - 1];
-  for (size_t i = 0; i < SM.node.size(); ++i)
-    if (!SM.isRim[i]) placeNode(M, SM.node[i], 2, k, u[i], varphi(surface, u[i]));
-  for (size_t j = 0; j < SM.rim.size(); ++j) {
-    int n = SM.node[SM.rim[j]], c = targets.corner[j];
-    double s = targets.s[j];
-    if (c < 0) {
-      placeNode(M, n, 1, curve, {s, 0}, gamma(Phi.rim, s));
-      continue;
-    }
-    M.corners.push_back({gamma(Phi.rim, Phi.cornerS[c]), {{curve, Phi.cornerS[c]}}});
+///   u, targets  ϕ_M⁻¹ of S_M's points, and of its rim along S's rim, the last curve of M
+///   returns     the nodes held at corners
+std::vector<int> placeNodes(Mesh& M, const ApproximatingSurface& SM, const std::vector<Vec2>& u,
+                            const RimTargets& targets, const std::array<double, 4>& cornerS) {
+  const int k = static_cast<int>(M.surfaces.size()), curve = static_cast<int>(M.curves.size());
+  for (std::size_t i = 0; i < u.size(); ++i)
+    if (!SM.isRim[i]) placeNode(M, SM.node[i], 2, k, u[i], varphi(M.surfaces[k - 1], u[i]));
+  std::vector<int> held;
+  for (std::size_t j = 0; j < SM.rim.size(); ++j) {
+    const int n = SM.node[SM.rim[j]], c = targets.corner[j];
+    const double s = targets.s[j];
+    placeNode(M, n, 1, curve, {s, 0}, gamma(M.curves[curve - 1], s));
+    if (c < 0) continue;
+    M.corners.push_back({gamma(M.curves[curve - 1], cornerS[c]), {{curve, cornerS[c]}}});
     placeNode(M, n, 0, static_cast<int>(M.corners.size()), {0, 0}, M.corners.back().x);
-    report.cornerNodes.push_back(n);
+    held.push_back(n);
   }
+  return held;
 }
 
 }  // namespace
 
 ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool followRim) {
-  const int k = static_cast<int>(M.surfaces.size()) + 1,
-            curve = static_cast<int>(M.curves.size()) + 1;
+  const int k = static_cast<int>(M.surfaces.size()) + 1;
   TriangleSurface split = cleaned;
   splitChords(split);
-  SurfaceDistance S(split);
+  const SurfaceDistance S(split);
   SurfaceParametrization Phi = parametrizeSurface(S);  // ϕ, eq. (3)
-  ApproximatingSurface SM = approximatingSurface(M, k, S);
-  ProjectionReport report;
-  RimTargets targets = followRim ? targetsFollowingRim(SM, Phi) : targetsByArcLength(SM, Phi);
-  std::vector<Vec2> u =
-      approximateParameters(SM, S, Phi, targets, followRim, report);  // ϕ_M⁻¹, eq. (3)
+  const ApproximatingSurface SM = approximatingSurface(M, k, S);
+  const RimTargets targets = rimTargets(SM, Phi, followRim);
+  std::vector<Vec2> u(SM.node.size());  // ϕ_M⁻¹, eq. (3)
+  for (std::size_t i = 0; i < SM.rim.size(); ++i)
+    u[SM.rim[i]] = rimParameter(Phi.cornerS, Phi.rim.s.back(), targets.s[i]);
+  u = followRim ? anchoredMap(SM, S, Phi.surface.u, u)
+                : floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
 
-  Phi.surface.rim = curve;
+  Phi.surface.rim = static_cast<int>(M.curves.size()) + 1;
   Phi.rim.sides[0].surface = k;
   buildLocator(Phi.surface);
   M.surfaces.push_back(Phi.surface);
   M.curves.push_back(Phi.rim);
-  placeNodes(M, k, curve, SM, Phi, targets, u, report);  // x', eq. (4)
-  for (size_t i = 0; i < SM.node.size(); ++i) {
-    double shift = norm(M.x[SM.node[i]] - S.query(SM.S.points[i]).point);
-    if (shift > report.tangentialShift) {
-      report.tangentialShift = shift;
-      report.shiftedNode = SM.node[i];
-    }
+  ProjectionReport report;
+  report.cornerNodes = placeNodes(M, SM, u, targets, Phi.cornerS);  // x', eq. (4)
+  for (std::size_t i = 0; i < SM.node.size(); ++i) {
+    const Vec3 nearest = S.query(SM.S.points[i]).point;
+    report.tangentialShift = std::max(report.tangentialShift, norm(M.x[SM.node[i]] - nearest));
   }
   return report;
 }
-
 
 // ==== 3. Surface insertion =======================================================================
 
@@ -3546,8 +3024,7 @@ bool contains(const Mesh& M, Vec3 p) {
 }
 
 std::string at(const Gap& gap) {
-  return " at triangle " + std::to_string(gap.triangle) + " near (" + number(gap.point.x) + ", " +
-         number(gap.point.y) + ", " + number(gap.point.z) + ")";
+  return " at triangle " + std::to_string(gap.triangle) + " near " + placeText(gap.point);
 }
 
 /// l_c against the distances of §3.1 and §3.2: S inside the domain, and clear of earlier surfaces.

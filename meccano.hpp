@@ -290,8 +290,10 @@ std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
 TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings);
 
 /// Neighbour across edge i (from vertex i to i + 1) of each triangle, -1 on the rim. [triangles]
+///   number  [triangles], what messages call them; empty: their index
 ///   errors  InputError where three triangles share an edge
-std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S);
+std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S,
+                                                   const std::vector<int>& number = {});
 /// The rims of a consistently oriented surface, each a closed loop of points with S on its left.
 std::vector<std::vector<int>> rimLoops(const TriangleSurface& S);
 
@@ -355,12 +357,8 @@ template <class Found> void TriangleTree::visit(Vec3 lo, Vec3 hi, Found found) c
   }
 }
 
-/// What S says about a point of space.
-struct SurfaceQuery {
-  double distance;   // |x - point|
-  Vec3 point;        // nearest point of S, in triangle with barycentric coordinates w
-  int triangle;
-  double w[3];
+/// What S says about a point x of space: its nearest point, and which side of S that is.
+struct SurfaceQuery : ClosestPoint {
   Vec3 normal;       // unit angle-weighted pseudo-normal of the nearest face, edge or vertex
   double side;       // (x - point) · normal: its sign is the side of S [§3.4]; beyond the rim this
                      // extends S tangentially
@@ -508,11 +506,11 @@ struct SparseMatrix {
   std::vector<double> value;   // [entries]
 };
 
-/// Solves A x = b by BiCGSTAB, preconditioned by relaxed ILU(0) (Jacobi where a pivot vanishes).
+/// Solves A x = b by BiCGSTAB with the SSOR preconditioner.
 ///   x          start value on entry, the solution on return
 ///   tolerance  of |b - A x| / |b|
 ///   returns    the iterations
-///   errors     SolverError, with the residual reached
+///   errors     SolverError: the residual reached; a row without diagonal entry
 int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
                   double tolerance = 1e-12, int maxIterations = 5000);
 
@@ -570,9 +568,6 @@ SurfaceParametrization parametrizeSurface(const SurfaceDistance& S);
 
 struct ProjectionReport {
   double tangentialShift = 0;     // largest distance of x' from the point of S nearest to x
-  int shiftedNode = -1;           // where
-  int flipped = 0;                // parametric triangles folded by the anchors, before the remedy
-  int rounds = 0;                 // solves of S_M's equations
   std::vector<int> cornerNodes;   // nodes fixed at sharp corners
 };
 
