@@ -3236,6 +3236,7 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
     measureSurface(trial, I.S, I.Q.h, now);
   } catch (const Error& error) {
     faults.push_back(describe(way) + ": " + error.what());
+    I.progress(faults.back());
     return;
   }
   if (report.surface == 0 || now.smoothed.min > report.smoothed.min)
@@ -3287,11 +3288,11 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
   double lc = options.lc;
   int ways = 0;
   for (int halving = 0; halving <= maxHalvings; ++halving, lc /= 2) {
-    if (halving > 0) checkSize(M, cleaned, lc, options.maxTets);
     bool valid = false;
     try {
+      if (halving > 0) checkSize(M, cleaned, lc, options.maxTets);
       valid = insertWithSize(M, cleaned, options, lc, ways, result, report, faults);
-    } catch (const MethodError& error) {
+    } catch (const Error& error) {
       faults.push_back(error.what());
     }
     if (!valid) continue;
@@ -3302,10 +3303,9 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
     M = std::move(result);
     return report;
   }
-  std::string why;
-  for (const std::string& fault : faults) why += "\n  " + fault;
   throw MethodError("insertSurface (§3): l_c = " + number(options.lc) +
-                    " does not resolve S, nor does half of it; lower l_c:" + why);
+                    " does not resolve S, nor does half of it; lower l_c (" +
+                    std::to_string(faults.size()) + " tries, the first: " + faults.front() + ")");
 }
 
 }  // namespace meccano
