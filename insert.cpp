@@ -3247,7 +3247,7 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
 bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions& options, double lc,
                     int& ways, Mesh& result, InsertReport& report,
                     std::vector<std::string>& faults) {
-  constexpr double goodQuality = .45;  // [choice] below it the other ways are tried too
+  constexpr double goodQuality = .6;  // [choice] min q below which the other ways are tried too
   Insertion I{S, options, M, {}, {}, static_cast<int>(M.surfaces.size()) + 1, ways};
   Bisection B(I.M);
   I.A = volumetricApproximation(B, S, lc);
@@ -3257,10 +3257,12 @@ bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions
   I.stage("healed", I.M);
   I.progress("3.2-3.3 approximation: " + std::to_string(I.M.tets.size()) + " tetrahedra, " +
              std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
+  auto isGood = [&] {
+    return report.surface > 0 &&
+           (report.smoothed.min >= goodQuality || options.outline == Outline::paper);
+  };
   std::vector<Outline> outlines{options.outline};
   if (options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
-  const double good = options.outline == Outline::paper ? 0 : goodQuality;
-  auto isGood = [&] { return report.surface > 0 && report.smoothed.min >= good; };
   for (Outline outline : outlines)
     if (!isGood())
       for (const Way& way : extractWays(I, outline, faults))
