@@ -47,7 +47,6 @@ class KeyMap {
     const std::size_t i = slot(key);
     return keys_[i] == empty ? 0 : values_[i];
   }
-  std::size_t size() const { return count_; }
 
  private:
   static constexpr std::uint64_t empty = ~std::uint64_t(0);
@@ -83,37 +82,39 @@ int localIndex(const std::array<int, 4>& tet, int n) {
 
 // ==== Tools: curves, and the point location in 𝓤 ================================================
 
-Vec3 gamma(const Curve& C, double s) {
+namespace {
+
+/// The segment of a curve from point i to the next, and the part t of it, at arc length s.
+struct CurvePlace { int i, next; double t; };
+CurvePlace placeOn(const Curve& C, double s) {
   const double length = C.s.back();
-  if (C.closed)
-    s -= length * std::floor(s / length);
-  else
-    s = std::clamp(s, 0.0, length);
+  s = C.closed ? s - length * std::floor(s / length) : std::clamp(s, 0., length);
   const int last = static_cast<int>(C.s.size()) - 2;
   const auto after = std::upper_bound(C.s.begin(), C.s.end(), s);
   const int i = std::clamp(static_cast<int>(after - C.s.begin()) - 1, 0, last);
-  const Vec3 a = C.points[i], b = C.points[(i + 1) % C.points.size()];
-  const double t = C.s[i + 1] > C.s[i] ? (s - C.s[i]) / (C.s[i + 1] - C.s[i]) : 0;
-  return t < .5 ? a + t * (b - a) : b + (1 - t) * (a - b);  // exact at both ends
+  const double step = C.s[i + 1] - C.s[i];
+  return {i, (i + 1) % static_cast<int>(C.points.size()), step > 0 ? (s - C.s[i]) / step : 0};
+}
+
+/// u of a surface along a curve that bounds it: as gamma, in 𝓤.
+Vec2 curveParameter(const Curve& C, const Curve::Side& side, double s) {
+  const CurvePlace at = placeOn(C, s);
+  return side.u[at.i] + at.t * (side.u[at.next] - side.u[at.i]);
+}
+
+}  // namespace
+
+Vec3 gamma(const Curve& C, double s) {
+  const CurvePlace at = placeOn(C, s);
+  const Vec3 a = C.points[at.i], b = C.points[at.next];
+  return at.t < .5 ? a + at.t * (b - a) : b + (1 - at.t) * (a - b);  // exact at both ends
 }
 
 namespace {
 
-/// u of a surface along a curve that bounds it: as gamma, in 𝓤.
-Vec2 curveParameter(const Curve& C, const Curve::Side& side, double s) {
-  const double length = C.s.back();
-  if (C.closed) s -= length * std::floor(s / length);
-  const int last = static_cast<int>(C.s.size()) - 2;
-  const auto after = std::upper_bound(C.s.begin(), C.s.end(), s);
-  const int i = std::clamp(static_cast<int>(after - C.s.begin()) - 1, 0, last);
-  const Vec2 a = side.u[i], b = side.u[(i + 1) % side.u.size()];
-  const double t = C.s[i + 1] > C.s[i] ? (s - C.s[i]) / (C.s[i + 1] - C.s[i]) : 0;
-  return a + t * (b - a);
-}
-
 /// Cell of the locator's grid along one axis.
 int gridCell(double coordinate, int size) {
-  return std::clamp(static_cast<int>(coordinate * size), 0, size - 1);
+  return coordinate > 0 ? static_cast<int>(std::min(coordinate * size, size - 1.)) : 0;
 }
 
 /// Range of cells that the triangle's box meets, widened by rounding.
@@ -360,6 +361,9 @@ Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells) {
   M.type.assign(M.tets.size(), 0);
   M.level.assign(M.tets.size(), 0);
   M.cube = {size.x / cells[0], size.y / cells[1], size.z / cells[2]};
+  const QualityStatistics q = qualityStatistics(M);
+  if (q.inverted > 0 || !(q.min > 0))
+    throw InputError("boxMesh: origin and size leave no digits for the cells; move or scale the box");
   return M;
 }
 
@@ -467,6 +471,44 @@ bool parameterOn(const Mesh& M, int n, int label, Vec2& u) {
 }
 
 namespace {
+
+/// Refuses a mesh whose arrays do not fit together, before anything indexes them.
+void checkMeccano(const Mesh& M, const std::string& who) {
+  const std::size_t nodes = M.x.size(), tets = M.tets.size();
+  auto refuse = [&](const std::string& what) { throw InputError(who + ": " + what); };
+  if (tets == 0) refuse("the mesh has no tetrahedra");
+  if (M.xi.size() != nodes)
+    refuse("the mesh has no computational coordinates, which bisection and projection need; make it by "
+           "boxMesh or `meccano box`, or read a meccano .vtk");
+  if (M.type.size() != tets || M.level.size() != tets || M.faceLabel.size() != tets ||
+      M.dimension.size() != nodes || M.entity.size() != nodes || M.parameter.size() != nodes)
+    refuse("the mesh lacks types, levels, labels or entities of some elements; make it by boxMesh, or "
+           "read a meccano .vtk");
+  if (!(M.cube.x > 0 && M.cube.y > 0 && M.cube.z > 0) || !std::isfinite(norm(M.cube)))
+    refuse("the edges of the mesh's cubes (Mesh::cube) must be finite and above 0");
+  const int patches = static_cast<int>(M.patches.size()), surfaces = static_cast<int>(M.surfaces.size());
+  for (std::size_t E = 0; E < tets; ++E)
+    for (int i = 0; i < 4; ++i) {
+      const int n = M.tets[E][i], label = M.faceLabel[E][i];
+      if (n < 0 || n >= static_cast<int>(nodes) || M.type[E] > 2 || M.level[E] % 3 != M.type[E] ||
+          label < -patches || label > surfaces)
+        refuse("tetrahedron " + std::to_string(E) + " has a node, type, level or label out of range");
+    }
+  const int counts[3] = {static_cast<int>(M.corners.size()), static_cast<int>(M.curves.size()), surfaces};
+  for (std::size_t n = 0; n < nodes; ++n) {
+    const int dimension = M.dimension[n], entity = M.entity[n];
+    const bool known = dimension == 3 || (dimension == 2 && entity < 0 && entity >= -patches) ||
+                       (dimension < 3 && entity > 0 && entity <= counts[dimension]);
+    if (!known || !isFinite(M.x[n]) || !isFinite(M.xi[n]) || std::min({M.xi[n].x, M.xi[n].y, M.xi[n].z}) < 0)
+      refuse("node " + std::to_string(n) + " has an entity or a coordinate out of range");
+  }
+  const int curves = counts[1];
+  for (const Parametrization& P : M.surfaces)
+    if (P.rim < 1 || P.rim > curves) refuse("surface '" + P.name + "' names no curve as its rim");
+  for (const Corner& corner : M.corners)
+    for (const Corner::Place& place : corner.on)
+      if (place.curve < 1 || place.curve > curves) refuse("a corner lies on a curve that is not there");
+}
 
 /// s of node n on curve c.
 bool parameterOnCurve(const Mesh& M, int n, int c, double& s) {
@@ -636,7 +678,7 @@ void Bisection::bisect(int E, int depth) {
 }
 
 void Bisection::bisectEdge(int a, int b) {
-  constexpr int maxRounds = 12;  // an edge of a tetrahedron is its refinement edge after two bisections
+  constexpr int maxRounds = 64;  // two bisections for each tetrahedron around the edge are enough
   for (int round = 0; round < maxRounds; ++round) {
     const int E = tetWithEdge(a, b);
     if (E < 0) return;
@@ -647,8 +689,7 @@ void Bisection::bisectEdge(int a, int b) {
 }
 
 void bisect(Mesh& M, const std::vector<int>& E) {
-  if (M.xi.size() != M.x.size() || M.level.size() != M.tets.size())
-    throw InputError("bisect (§3.2): the mesh has no computational coordinates; make it by boxMesh");
+  checkMeccano(M, "bisect (§3.2)");
   Bisection B(M);
   std::vector<int> level;
   for (int t : E) {
@@ -1299,8 +1340,9 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wa
 }  // namespace
 
 int cubeLevel(const Mesh& M, double lc) {
+  constexpr int maxLevel = 240;  // levels fit in a byte
   int level = 0;
-  for (double diagonal = norm(M.cube); diagonal >= lc; diagonal /= 2) level += 3;
+  for (double diagonal = norm(M.cube); diagonal >= lc && level < maxLevel; diagonal /= 2) level += 3;
   return level;
 }
 
@@ -1309,6 +1351,7 @@ Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, do
   refineCut(B, S, cut, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
   Approximation A;
   A.level = cubeLevel(B.M, lc);
+  // [choice] on to whole cubes, which §3.3 asks for: up to two bisections more than eq. (1)
   refineCut(B, S, cut, [&](int E) { return B.M.level[E] < A.level; });
   A.T.resize(cut.size());
   for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E] == Cut::yes;
@@ -1401,8 +1444,8 @@ bool isLocalDisk(unsigned cubes) {
 
 namespace {
 
-/// Adds to T whatever shares a cube with an element of it: a boundary face of T that is not on the
-/// lattice's planes has its neighbour refined to the same level and added.
+/// Whole cubes: the neighbour across each boundary face of T that is not on the lattice's planes is refined
+/// to the same level and added. (There is one: ∂M lies on the lattice's planes.)
 void completeCubes(Bisection& B, Approximation& A, std::vector<int> queue) {
   const Lattice lattice(A.level);
   std::array<std::int64_t, 3> square;
@@ -1688,7 +1731,7 @@ int largestPart(const std::vector<int>& sizes) {
   return static_cast<int>(std::max_element(sizes.begin(), sizes.end()) - sizes.begin());
 }
 
-/// Keeps the largest edge-connected part of the selection and fills its holes.
+/// [choice] Keeps the largest edge-connected part of the selection and fills its holes.
 void keepLargestPart(const SquareSurface& Q, const Survey& survey, Selection& selected) {
   std::vector<int> sizes;
   std::vector<int> part = connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
@@ -1717,7 +1760,7 @@ NodeState nodeState(const SquareSurface& Q, const Selection& selected, int n) {
   return state;
 }
 
-/// A pinch is a node with more than two rim edges: squares at it that are not in its largest fan go.
+/// [choice] At a pinch, a node with more than two rim edges, the square with the fewest selected neighbours goes.
 bool cutPinches(const SquareSurface& Q, Selection& selected) {
   bool any = false;
   for (int n : Q.nodes) {
@@ -1736,11 +1779,8 @@ bool cutPinches(const SquareSurface& Q, Selection& selected) {
   return any;
 }
 
-}  // namespace
-
-namespace {
-
-/// [§3.4] The squares with all nodes on one side of S; one disk.
+/// [§3.4] The squares with all nodes on one side of S; one disk. [departure] Whole squares, where the paper
+/// selects triangles: S_M is then bounded by lattice edges, as §3.5 takes for granted.
 Selection selectSquares(const SquareSurface& Q, const Survey& survey, int side) {
   constexpr double maxExcess = .75;  // [choice] of h: squares farther beyond the rim are no candidates
   constexpr int maxRounds = 100;
@@ -1775,7 +1815,7 @@ int chiOf(const SquareSurface& Q, const Selection& selected) {
   return vertices - edges + faces;
 }
 
-/// 0 where S_M is one disk: else what is wrong, for the message.
+/// Empty where S_M is one disk; else what is wrong, for the message.
 std::string diskFault(const SquareSurface& Q, const Selection& selected) {
   std::vector<int> sizes;
   connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
@@ -1989,10 +2029,6 @@ class RimRegularization {
   bool halves_ = false;
 };
 
-}  // namespace
-
-namespace {
-
 /// 5000 × the area mean over S of max(0, dist(S, S_M)/h − 1.1)²: S must be near its approximation.
 double uncovered(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
                  const Selection& selected) {
@@ -2060,7 +2096,7 @@ Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const Surfac
 
 namespace {
 
-/// The faces labelled k, and the square and quarter of ∂T where each lies.
+/// The quarter of a square of ∂T in which a face lies.
 int quarterOf(const Mesh& M, const SquareSurface& Q, int square, std::array<int, 3> face) {
   const Vec3 middle = (1. / 3) * (M.xi[face[0]] + M.xi[face[1]] + M.xi[face[2]]);
   const std::array<int, 4>& n = Q.squares[square].node;
@@ -2178,7 +2214,6 @@ bool refineEdgesAcrossTheRim(Bisection& B, int k) {
 
 bool refineEdgesBetweenSurfaces(Bisection& B, int k) {
   const SurfaceComplex SM(B.M, k);
-  const std::size_t before = B.M.tets.size();
   std::vector<std::pair<int, int>> refine;
   for (const std::array<int, 4>& z : B.M.tets)
     for (const auto& e : tetEdges) {
@@ -2187,8 +2222,7 @@ bool refineEdgesBetweenSurfaces(Bisection& B, int k) {
           (SM.node[b] && B.M.dimension[a] < 3 && !SM.node[a]))
         refine.push_back({a, b});
     }
-  bisectEdges(B, refine);
-  return B.M.tets.size() > before;
+  return bisectEdges(B, refine);
 }
 
 bool refineToFullSubcomplex(Bisection& B, int k) {
@@ -2522,8 +2556,8 @@ constexpr double cornerWindow = .03, narrowWindow = .01;
 /// [choice] Least distance of two corners along the rim, of its length; for turns that are not
 /// sharp the second, lest a rounded corner counts twice.
 constexpr double cornerSpacing = .02, weakSpacing = .08;
-/// [choice] Turns that make a corner of 𝓤, and a sharp corner of the geometry (over both windows).
 constexpr double degree = 3.14159265358979323846 / 180;
+/// [choice] Turns that make a corner of 𝓤, and a sharp corner of the geometry (over both windows).
 constexpr double cornerTurn = 30 * degree, sharpTurn = 45 * degree, sharpTurnNarrow = 35 * degree;
 
 /// A closed curve through these points of x.
@@ -2578,8 +2612,9 @@ int middleOfLongestArc(const std::vector<double>& s, std::vector<int> chosen) {
 }  // namespace
 
 void splitChords(TriangleSurface& S) {
-  while (splitChordsOnce(S) > 0) {
-  }  // ends: a chord's new point is inside, so each round leaves fewer chords
+  constexpr int maxRounds = 64;  // a chord's new point is inside: one round, two where the rim had three points
+  for (int round = 0; round < maxRounds && splitChordsOnce(S) > 0; ++round) {
+  }
 }
 
 RimCorners rimCorners(const SurfaceDistance& S) {
@@ -2880,7 +2915,7 @@ constexpr double anchorMu = .3, foldedFactor = .2;
 constexpr int maxRings = 63;
 
 /// Takes the anchors of the points of the triangles and of `rings` rings of triangles around away.
-void releaseAnchors(const TriangleSurface& S, const std::vector<int>& triangles, int rings,
+void weakenAnchors(const TriangleSurface& S, const std::vector<int>& triangles, int rings,
                     std::vector<double>& mu) {
   std::vector<char> marked(S.points.size(), 0);
   for (int t : triangles)
@@ -2914,7 +2949,7 @@ std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDista
     u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor);
     const std::vector<int> flipped = flippedTriangles(SM.S.triangles, u);
     if (flipped.empty()) return u;
-    releaseAnchors(SM.S, flipped, rings, mu);
+    weakenAnchors(SM.S, flipped, rings, mu);
   }
   return floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
 }
@@ -2990,25 +3025,6 @@ InsertOptions InsertOptions::paper() {
 
 namespace {
 
-/// What §3.1 asks of M: a valid meccano mesh.
-void checkMeccano(const Mesh& M) {
-  const std::size_t nodes = M.x.size(), tets = M.tets.size();
-  if (tets == 0) throw InputError("insertSurface (§3.1): the mesh has no tetrahedra");
-  if (M.xi.size() != nodes)
-    throw InputError(
-        "insertSurface (§3.1): the mesh has no computational coordinates, which bisection and "
-        "projection need; make it by boxMesh or `meccano box`, or read a meccano .vtk");
-  if (M.type.size() != tets || M.level.size() != tets || M.faceLabel.size() != tets ||
-      M.dimension.size() != nodes || M.entity.size() != nodes || M.parameter.size() != nodes)
-    throw InputError(
-        "insertSurface (§3.1): the mesh lacks types, levels, labels or entities of some elements; "
-        "make it by boxMesh, or read a meccano .vtk");
-  const QualityStatistics q = qualityStatistics(M);
-  if (q.inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(q.inverted) +
-                     " inverted elements; untangle it first (optimizeMesh)");
-}
-
 /// Whether p lies in one of the tetrahedra.
 bool contains(const Mesh& M, Vec3 p) {
   for (const std::array<int, 4>& z : M.tets) {
@@ -3021,6 +3037,16 @@ bool contains(const Mesh& M, Vec3 p) {
     if (in) return true;
   }
   return false;
+}
+
+void checkOptions(const InsertOptions& options, std::size_t nodes) {
+  constexpr int mostTets = 500000000;  // indices of four faces each fit in an int
+  if (!(options.lc > 0) || !std::isfinite(options.lc))
+    throw InputError("insertSurface (§3.2): l_c = " + number(options.lc) + " must be above 0");
+  if (options.maxTets < 1 || options.maxTets > mostTets)
+    throw InputError("insertSurface (§3.2): maxTets = " + std::to_string(options.maxTets) +
+                     " must be from 1 to " + std::to_string(mostTets));
+  checkOptions(options.optimize, nodes);
 }
 
 std::string at(const Gap& gap) {
@@ -3085,17 +3111,27 @@ struct Way { int side; Outline outline; Extraction extraction; };
 struct Insertion {
   const SurfaceDistance& S;
   const InsertOptions& options;
-  Mesh M;              // refined by §3.2 and §3.3
-  Approximation A;
-  SquareSurface Q;
-  int k;               // number of the new surface
-  int& ways;           // tried so far, over all l_c
+  int k;                  // number of the new surface
+  Mesh M = {};            // refined by §3.2 and §3.3
+  Approximation A = {};
+  SquareSurface Q = {};
+  int ways = 0;           // tried so far, over all l_c
+  int faults = 0;         // and left; why the last one was, without prefix and advice
+  std::string reason = {};
 
   void stage(const char* name, const Mesh& mesh) const {
     if (options.onStage) options.onStage(name, mesh);
   }
   void progress(const std::string& line) const {
     if (options.onProgress) options.onProgress(line);
+  }
+  void leave(const std::string& what, const Error& error) {
+    const std::string message = error.what();
+    const std::size_t start = message.find("): ");
+    reason = message.substr(start == std::string::npos ? 0 : start + 3);
+    reason = reason.substr(0, reason.find("; "));
+    ++faults;
+    progress(what + " left: " + reason);
   }
 };
 
@@ -3105,14 +3141,14 @@ std::string describe(const Way& way) {
 }
 
 /// §3.4 on both sides: the ways to go on with this outline, best first.
-std::vector<Way> extractWays(const Insertion& I, Outline outline, std::vector<std::string>& faults) {
+std::vector<Way> extractWays(Insertion& I, Outline outline) {
   std::vector<Way> ways;
   for (int side : {1, -1}) {
     Way way{side, outline, surfaceExtraction(I.M, I.Q, I.S, side, outline)};
     if (way.extraction.fault.empty())
       ways.push_back(std::move(way));
     else
-      faults.push_back(describe(way) + ": S_M is no disk (" + way.extraction.fault + ")");
+      I.leave(describe(way), MethodError("insertSurface (§3.4): S_M is no disk, " + way.extraction.fault));
   }
   if (ways.size() == 2 && ways[1].extraction.energy < ways[0].extraction.energy)
     std::swap(ways[0], ways[1]);
@@ -3161,6 +3197,7 @@ void optimizeAround(Bisection& B, const Insertion& I, InsertReport& report) {
         B.bisect(static_cast<int>(E));
       }
     surfaceHealing(B, I.k);
+    optimize.active.clear();
     const int sweeps = report.optimization.sweeps;
     report.optimization = optimizeMesh(B.M, optimize);
     report.optimization.sweeps += sweeps;
@@ -3169,9 +3206,10 @@ void optimizeAround(Bisection& B, const Insertion& I, InsertReport& report) {
 }
 
 /// §3.4's labels, 3.5, 3.6 and 3.7 on a copy of the refined mesh.
-void follow(const Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
+void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   Bisection B(M);
   labelSurface(B, I.Q, I.A, way.extraction.selected, I.k);
+  report.way = ++I.ways;
   I.stage("extracted", M);
   const int rounds = surfaceHealing(B, I.k);
   if (surfaceFaces(M, I.k).empty())
@@ -3204,10 +3242,10 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
   std::vector<char> on(M.x.size(), 0);
   for (const auto& face : faces)
     for (int n : face) {
-      if (on[n]++) continue;
+      if (on[n]) continue;
+      on[n] = 1;
       ++report.nodes;
       report.maxNodeDistance = std::max(report.maxNodeDistance, S.query(M.x[n]).distance);
-      on[n] = 1;
     }
   report.triangles = static_cast<int>(faces.size());
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
@@ -3224,34 +3262,32 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
 }
 
 /// Follows one way; keeps its mesh and report where it is the best valid one so far.
-void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport& report,
-            std::vector<std::string>& faults) {
+void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport& report) {
   Mesh trial = I.M;
-  InsertReport now;
-  now.way = ++I.ways;
-  now.original = report.original, now.warnings = report.warnings;
-  now.surface = I.k, now.lc = lc;
+  InsertReport ofThisWay;
+  ofThisWay.original = report.original;
+  ofThisWay.surface = I.k, ofThisWay.lc = lc;
   try {
-    follow(I, way, trial, now);
-    measureSurface(trial, I.S, I.Q.h, now);
-  } catch (const Error& error) {
-    faults.push_back(describe(way) + ": " + error.what());
-    I.progress(faults.back());
+    insertOnWay(I, way, trial, ofThisWay);
+    measureSurface(trial, I.S, I.Q.h, ofThisWay);
+  } catch (const MethodError& error) {
+    I.leave(describe(way), error);
+    return;
+  } catch (const SolverError& error) {
+    I.leave(describe(way), error);
     return;
   }
-  if (report.surface == 0 || now.smoothed.min > report.smoothed.min)
-    report = now, result = std::move(trial);
+  if (report.surface == 0 || ofThisWay.smoothed.min > report.smoothed.min)
+    report = ofThisWay, result = std::move(trial);
 }
 
-/// One l_c: 3.2 to 3.7 on all ways until one is good; the best valid one. False where none is valid.
-bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions& options, double lc,
-                    int& ways, Mesh& result, InsertReport& report,
-                    std::vector<std::string>& faults) {
+/// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and report.
+void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, InsertReport& report) {
   constexpr double goodQuality = .6;  // [choice] min q below which the other ways are tried too
-  Insertion I{S, options, M, {}, {}, static_cast<int>(M.surfaces.size()) + 1, ways};
+  I.M = M;
   Bisection B(I.M);
-  I.A = volumetricApproximation(B, S, lc);
-  I.stage("refined", I.M);
+  I.A = volumetricApproximation(B, I.S, lc);
+  I.stage("approximated", I.M);
   volumetricHealing(B, I.A);
   I.Q = boundarySquares(I.M, I.A);
   I.stage("healed", I.M);
@@ -3259,55 +3295,60 @@ bool insertWithSize(const Mesh& M, const SurfaceDistance& S, const InsertOptions
              std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
   auto isGood = [&] {
     return report.surface > 0 &&
-           (report.smoothed.min >= goodQuality || options.outline == Outline::paper);
+           (report.smoothed.min >= goodQuality || I.options.outline == Outline::paper);
   };
-  std::vector<Outline> outlines{options.outline};
-  if (options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
+  std::vector<Outline> outlines{I.options.outline};
+  if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
+  std::vector<Selection> tried;
   for (Outline outline : outlines)
     if (!isGood())
-      for (const Way& way : extractWays(I, outline, faults))
-        if (!isGood()) tryWay(I, way, lc, result, report, faults);
-  return report.surface > 0;
+      for (const Way& way : extractWays(I, outline)) {
+        const Selection& selected = way.extraction.selected;
+        if (isGood() || std::find(tried.begin(), tried.end(), selected) != tried.end()) continue;
+        tried.push_back(selected);
+        tryWay(I, way, lc, result, report);
+      }
 }
 
 }  // namespace
 
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
   constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
-  checkMeccano(M);
-  if (!(options.lc > 0) || !std::isfinite(options.lc))
-    throw InputError("insertSurface (§3.2): l_c = " + number(options.lc) + " must be above 0");
+  checkMeccano(M, "insertSurface (§3.1)");
+  checkOptions(options, M.x.size());
   InsertReport report;
   report.original = qualityStatistics(M);
-  TriangleSurface disk = checkSurface(S, report.warnings);
+  if (report.original.inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(report.original.inverted) +
+                     " inverted elements; untangle it first (optimizeMesh)");
+  std::vector<std::string> warnings;
+  TriangleSurface disk = checkSurface(S, warnings);
   splitChords(disk);
   const SurfaceDistance cleaned(disk);
   checkDistances(M, cleaned, options.lc);
   checkSize(M, cleaned, options.lc, options.maxTets);
 
+  Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1};
   Mesh result;
-  std::vector<std::string> faults;
   double lc = options.lc;
-  int ways = 0;
-  for (int halving = 0; halving <= maxHalvings; ++halving, lc /= 2) {
-    bool valid = false;
-    try {
+  for (int halving = 0; halving <= maxHalvings && report.surface == 0; ++halving, lc /= 2) try {
       if (halving > 0) checkSize(M, cleaned, lc, options.maxTets);
-      valid = insertWithSize(M, cleaned, options, lc, ways, result, report, faults);
-    } catch (const Error& error) {
-      faults.push_back(error.what());
+      insertWithSize(I, M, lc, result, report);
+    } catch (const MethodError& error) {
+      I.leave("l_c = " + number(lc), error);
     }
-    if (!valid) continue;
-    if (halving > 0)
-      report.warnings.push_back("l_c was halved to " + number(lc) + ": " + faults.front());
-    report.regular = qualityStatistics(result, Ideal::regular);
-    if (options.onStage) options.onStage("smoothed", result);
-    M = std::move(result);
-    return report;
-  }
-  throw MethodError("insertSurface (§3): l_c = " + number(options.lc) +
-                    " does not resolve S, nor does half of it; lower l_c (" +
-                    std::to_string(faults.size()) + " tries, the first: " + faults.front() + ")");
+  if (report.surface == 0)
+    throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
+                      " nor at half of it, after " + std::to_string(I.faults) +
+                      " tries, the last because " + I.reason + "; lower l_c");
+  if (report.lc < options.lc)
+    warnings.push_back("l_c was halved to " + number(report.lc) + ", because at " +
+                       number(options.lc) + " no way was valid");
+  report.warnings.insert(report.warnings.begin(), warnings.begin(), warnings.end());
+  report.regular = qualityStatistics(result, Ideal::regular);
+  I.stage("smoothed", result);
+  M = std::move(result);
+  return report;
 }
 
 }  // namespace meccano

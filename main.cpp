@@ -1227,6 +1227,9 @@ void runInsert(const Arguments& a, const Streams& io) {
     fail("insert: " + std::to_string(a.operands.size() - 1) +
          " surfaces are given, and this version inserts one; name one");
   const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
+  for (const char* stage : {"original", "refined", "projected", "smoothed"})
+    if (!prefix.empty() && path == prefix + "-" + stage + ".vtk")
+      throw UsageError("the mesh and a stage would both be written to " + path);
   checkWritable(path);
   if (!prefix.empty()) checkWritable(prefix + "-original.vtk");
   Mesh M = readMesh(a.operands[0]);
@@ -1244,10 +1247,11 @@ void runInsert(const Arguments& a, const Streams& io) {
   const InsertReport report = insertSurface(M, S, options);
   std::vector<Output> outputs{{path, vtkText(M)}};
   stages.take(report.way, outputs);
+  printInsertion(report, S.name, io);
+  if (!io.out.flush()) fail("standard output: the results cannot be written; nothing was written");
   writeFiles(outputs);
   for (const std::string& w : report.warnings) progress.warning(w);
   progress.line(path + ": " + sizeOf(M));
-  printInsertion(report, S.name, io);
 }
 
 OptimizeOptions optimizeOptions(const Arguments& a) {

@@ -10,7 +10,7 @@
 //            compile the two .cpp with your code, call meccano::insertSurface,
 //            catch meccano::Error (your mesh is then what it was).
 //
-// Limits: at most 2^31 - 1 nodes or tetrahedra; surfaces are disks with a rim, and touch neither
+// Limits: at most 5e8 tetrahedra; surfaces are disks with a rim, and touch neither
 // each other nor the boundary. The library never prints, opens a file, reads the clock, draws random
 // numbers or keeps global state: the same input gives the same bytes.
 //
@@ -191,11 +191,12 @@ struct InsertOptions {
   Outline outline = Outline::halfSquares;  // [§3.5 departure]
   bool followRim = true;      // [§3.6 departure] rim correspondence and anchored equations
   int maxTets = 20000000;     // refuse where more tetrahedra are predicted
-  OptimizeOptions optimize;   // §3.7
-  // Called after each stage with the mesh as it is then: "refined" (3.2), "healed" (3.3), for each way that is
+  OptimizeOptions optimize;   // §3.7; its active and globalDescent are set by the insertion
+  // Called after each stage with the mesh as it is then: "approximated" (3.2), "healed" (3.3), for each way that is
   // tried "extracted" (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the end "smoothed" (3.7).
   std::function<void(const char* stage, const Mesh&)> onStage = nullptr;
   std::function<void(const std::string& line)> onProgress = nullptr;  // a line per step
+  // A callback may throw to stop, but no MethodError or SolverError: M is then unchanged.
 
   static InsertOptions paper();  // the paper to the letter, but for the full subcomplex of §3.5
 };
@@ -207,8 +208,8 @@ struct InsertReport {
   int nodes = 0, triangles = 0;// of S_M
   double maxNodeDistance = 0;  // largest |x_i - S| of the nodes of S_M
   double hausdorff = 0;        // two-sided, S_M - S, sampled
-  double tangentialShift = 0;  // largest distance a node was moved along S by the projection and the smoothing
-  QualityStatistics original, refined, projected, smoothed;  // against the computational elements
+  double tangentialShift = 0;  // largest distance of a projected node from the point of S nearest to it before
+  QualityStatistics original, refined, projected, smoothed;  // against the computational elements; refined: after 3.5
   QualityStatistics regular;                                 // smoothed, against the regular tetrahedron
   OptimizeReport optimization;
   std::vector<std::string> warnings;  // valid but poor: what and where
@@ -601,16 +602,21 @@ double etaRegularized(const Mat3& J, double delta);
 /// [§3.7.1, δ after 23, 30] δ with h(σ_min) = mu: δ² = mu (mu − σ_min); 0 where σ_min > 0 and no regularization is needed.
 double chooseDelta(double sigmaMin, double mu);
 
+/// Refuses options out of range for a mesh of so many nodes: InputError.
+void checkOptions(const OptimizeOptions& options, std::size_t nodes);
+
 /// An objective with its derivatives at one point.
 struct Objective { double f; Vec3 gradient; Mat3 hessian; };
 
-/// The star of a node: what eq. (9) needs of the elements adjacent to it, in closed form.
+/// The star of a node: what eq. (9) needs of the elements adjacent to it, in closed form. With g the
+/// gradient, in the ideal element, of the node's barycentric function, and d its displacement:
+/// J = J₀ + d gᵀ, so that ‖J‖² = N + 2 v·d + |g|²|d|² and det J = σ + s·d, exactly.
 struct StarElement {
-  Mat3 J0;    // J with the node at `origin`
-  Vec3 g;     // gradient, in the ideal element, of the node's barycentric function: J(x) = J0 + (x − origin) gᵀ
+  double N, sigma, gg;  // ‖J₀‖², det J₀, |g|²
+  Vec3 v, s;            // J₀ g, cof(J₀) g
 };
 struct Star {
-  Vec3 origin;                        // the node's position when the star was built
+  Vec3 origin;                        // the node's position where d = 0
   std::vector<StarElement> elements;  // the m adjacent tetrahedra
 };
 /// The star of node n; `around` are the tetrahedra adjacent to it.

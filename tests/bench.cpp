@@ -19,7 +19,7 @@ struct Size {
   double lc;
 };
 constexpr Size sizes[] = {{2, .12}, {2, .06}, {5, .024}, {5, .012}};
-constexpr const char* stages[] = {"refined",       "healed",    "extracted",
+constexpr const char* stages[] = {"approximated",       "healed",    "extracted",
                                   "surfaceHealed", "projected", "smoothed"};
 
 class Clock {

@@ -425,7 +425,7 @@ TEST_SUITE("2") {
   TEST_CASE("bisection: a mesh that is no bisection of Kuhn cubes is refused, the closure ends") {
     // three tetrahedra around the edge 0 1, each waiting for the next one's refinement edge
     Mesh M;
-    M.xi = {{0, 0, 0}, {0, 0, 1}, {1, 0, 0}, {-.5, .8, 0}, {-.5, -.8, 0}};
+    M.xi = {{1, 1, 0}, {1, 1, 1}, {2, 1, 0}, {.5, 1.8, 0}, {.5, .2, 0}};
     M.x = M.xi;
     M.tets = {{0, 2, 3, 1}, {0, 3, 4, 1}, {0, 4, 2, 1}};
     M.type.assign(3, 0);
@@ -436,6 +436,11 @@ TEST_SUITE("2") {
     M.parameter.assign(5, {});
     const std::string message = messageOf<MethodError>([&] { bisect(M, {0}); });
     CHECK(contains(message, "no bisection of Kuhn cubes"));
+  }
+
+  TEST_CASE("box: sizes that leave no digits for the cells are refused") {
+    CHECK(contains(messageOf<InputError>([] { boxMesh({1e20, 0, 0}, {1, 1, 1}, {2, 2, 2}); }), "digits"));
+    CHECK(contains(messageOf<InputError>([] { boxMesh({0, 0, 0}, {1e300, 1, 1}, {1, 1, 1}); }), "digits"));
   }
 
   TEST_CASE("neighbours: two tetrahedra see each other across their common face") {

@@ -324,7 +324,7 @@ TEST_SUITE("3.2") {
     CHECK(visited == 3);
   }
 
-  TEST_CASE("eq. (1), dist(dM, S): smallestGap of two triangle sets") {
+  TEST_CASE("dist(dM, S): smallestGap of two triangle sets") {
     TriangleSurface S = bentGrid(9, 7);
     TriangleTree tree(S.points, S.triangles);
     TriangleSurface above = S;

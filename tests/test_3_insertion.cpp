@@ -175,7 +175,7 @@ TEST_SUITE("3") {
     CHECK(M.tets.size() >= 4000);
     CHECK(M.tets.size() <= 8000);
     CHECK(report.warnings.empty());
-    CHECK(stages == std::vector<std::string>{"refined", "healed", "extracted", "surfaceHealed", "projected", "smoothed"});
+    CHECK(stages == std::vector<std::string>{"approximated", "healed", "extracted", "surfaceHealed", "projected", "smoothed"});
     REQUIRE(at.size() == 6);
     CHECK(at[3].mean == report.refined.mean);
     CHECK(at[3].tetrahedra == report.refined.tetrahedra);
@@ -414,6 +414,28 @@ TEST_SUITE("3") {
     CHECK(refusal(nodeless, S, withSize(.14), true) != "");
   }
 
+  TEST_CASE("failure: a host's mesh with indices or numbers out of range is refused, not followed") {
+    const TriangleSurface S = samples::sine(.1, 8);
+    auto refused = [&](const std::function<void(Mesh&)>& spoil, const char* word) {
+      Mesh M = unitBox();
+      spoil(M);
+      const std::string text = refusal(M, S, withSize(.14), true);
+      CHECK_MESSAGE(has(text, word), text);
+    };
+    refused([](Mesh& M) { M.tets[3][2] = 999; }, "tetrahedron 3");
+    refused([](Mesh& M) { M.tets[3][2] = -1; }, "tetrahedron 3");
+    refused([](Mesh& M) { M.type[5] = 2; }, "tetrahedron 5");
+    refused([](Mesh& M) { M.faceLabel[7][0] = 1; }, "tetrahedron 7");
+    refused([](Mesh& M) { M.entity[1] = 77; }, "node 1");
+    refused([](Mesh& M) { M.dimension[13] = 9; }, "node 13");
+    refused([](Mesh& M) { M.patches.clear(); }, "out of range");
+    refused([](Mesh& M) { M.corners[0].on[0].curve = 13; }, "curve");
+    refused([](Mesh& M) { M.x[13].y = HUGE_VAL; }, "node 13");
+    refused([](Mesh& M) { for (Vec3& xi : M.xi) xi.z -= 1; }, "out of range");
+    for (double edge : {1e200, -.5, 0., std::nan("")})
+      refused([&](Mesh& M) { M.cube = {edge, .5, .5}; }, "cube");
+  }
+
   TEST_CASE("failure: options out of range leave the mesh as it was") {
     const TriangleSurface S = samples::sine(.1, 16);
     Mesh M = unitBox();
@@ -421,6 +443,12 @@ TEST_SUITE("3") {
     InsertOptions small = withSize(.12);
     small.maxTets = 100;
     CHECK(has(refusal(M, S, small, true), "limit"));
+    small.maxTets = -5;
+    CHECK(has(refusal(M, S, small, true), "maxTets"));
+    InsertOptions steep = withSize(.12);
+    steep.optimize.power = 1000;
+    CHECK(has(refusal(M, S, steep, true), "power"));
+    CHECK(cubeLevel(M, 1e-300) <= 255);  // ends
   }
 
   TEST_CASE("failure: an optimization that may not end is refused, and the mesh stays as it was") {
@@ -444,13 +472,13 @@ TEST_SUITE("3") {
       checkPromises(before, M, S, 1, report, 1e-12 * shapes::diagonal(S));
       CHECK_FALSE(report.warnings.empty());  // poor at the least
     } catch (const MethodError& error) {
-      CHECK(has(error.what(), "does not resolve S"));
+      CHECK(has(error.what(), "no valid mesh at l_c"));
       CHECK(shapes::sameMesh(M, before));
     }
   }
 
   TEST_CASE("failure: an exception of the host's own callback leaves the mesh as it was") {
-    for (const char* name : {"refined", "healed", "extracted", "surfaceHealed", "projected", "smoothed"}) {
+    for (const char* name : {"approximated", "healed", "extracted", "surfaceHealed", "projected", "smoothed"}) {
       Mesh M = unitBox();
       const Mesh before = M;
       InsertOptions options = withSize(.14);
