@@ -443,6 +443,10 @@ struct Smoother {
   std::vector<double> unrest =
       {};  // [nodes] largest move in its star since its last visit, relative
 
+  struct SheetTriangle { int a, b, label; };  // with its node counter-clockwise in 𝓤 of the surface
+  std::vector<int> sheetStart = {};           // [nodes + 1] surface triangles at n, rows of sheet
+  std::vector<SheetTriangle> sheet = {};
+
   double delta = 0;  // of the sweep, relative to the mean σ
   Penalty penalty = plainEta;
   double wake = 0;                       // unrest from which a node is visited
@@ -517,6 +521,36 @@ void buildFreedom(Smoother& S) {
   for (int n : S.options.active) S.unrest[n] = unbounded;
 }
 
+/// The labelled faces at each sliding node, as triangles of 𝓤.
+void buildSheets(Smoother& S) {
+  const Mesh& M = S.M;
+  if (M.faceLabel.empty() || M.dimension.empty()) return;
+  std::vector<std::pair<int, Smoother::SheetTriangle>> entries;
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int k = 0; k < 4; ++k) {
+      const int label = M.faceLabel[E][k];
+      if (label == 0) continue;
+      int v[3];
+      Vec2 u[3];
+      bool known = true;
+      for (int i = 0; i < 3; ++i) {
+        v[i] = M.tets[E][opposite[k][i]];
+        known = known && parameterOn(M, v[i], label, u[i]);
+      }
+      const double area = known ? cross(u[1] - u[0], u[2] - u[0]) : 0;
+      if (area < 0) std::swap(v[1], v[2]);
+      for (int i = 0; i < 3 && area != 0; ++i)
+        if (S.freedom[v[i]] == 1 || S.freedom[v[i]] == 2)
+          entries.push_back({v[i], {v[(i + 1) % 3], v[(i + 2) % 3], label}});
+    }
+  S.sheetStart.assign(M.x.size() + 1, 0);
+  for (const auto& entry : entries) ++S.sheetStart[entry.first + 1];
+  for (std::size_t n = 0; n < M.x.size(); ++n) S.sheetStart[n + 1] += S.sheetStart[n];
+  S.sheet.resize(entries.size());
+  std::vector<int> next = S.sheetStart;
+  for (const auto& entry : entries) S.sheet[next[entry.first]++] = entry.second;
+}
+
 struct Validity {
   int inverted;
   double sigmaMin;
@@ -569,6 +603,24 @@ double visitInner(Smoother& S, int n, const Edges& edges) {
   return step.t * norm(d.p);
 }
 
+/// [departure] Whether the surface triangles at n stay counter-clockwise in 𝓤 with n at this parameter.
+/// While elements are inverted f alone lets a node slide past its neighbours, or a rim node round a
+/// corner, from where no descent brings it back.
+bool staysUnfolded(Smoother& S, int n, Vec2 parameter) {
+  if (S.sheetStart.empty()) return true;
+  const Vec2 before = S.M.parameter[n];
+  S.M.parameter[n] = parameter;
+  bool unfolded = true;
+  Vec2 u, a, b;
+  for (int k = S.sheetStart[n]; k < S.sheetStart[n + 1] && unfolded; ++k) {
+    const Smoother::SheetTriangle& t = S.sheet[k];
+    unfolded = parameterOn(S.M, n, t.label, u) && parameterOn(S.M, t.a, t.label, a) &&
+               parameterOn(S.M, t.b, t.label, b) && cross(a - u, b - u) > 0;
+  }
+  S.M.parameter[n] = before;
+  return unfolded;
+}
+
 /// Step of the paper's differences, relative to the shortest edge. Second derivatives have errors
 /// of 1e-8 by truncation and by cancellation.
 constexpr double differenceStep = 1e-4;
@@ -596,7 +648,11 @@ double visitSliding(Smoother& S, int n, const Edges& edges) {
   if (!(-d.slope > roundingOfF * o.f)) return 0;
   const Vec2 p{d.p.x, d.p.y};
   double t = std::min(S.options.relaxation, d.tMax);
-  for (int k = 0; !(F(t * p) <= o.f + wolfeC1 * t * d.slope); t /= 2)
+  const auto isStep = [&](double length) {
+    return F(length * p) <= o.f + wolfeC1 * length * d.slope &&
+           staysUnfolded(S, n, placeOf(S.M, n, u + length * p).parameter);
+  };
+  for (int k = 0; !isStep(t); t /= 2)
     if (++k == wolfeEvaluations) return 0;
   const Place at = placeOf(S.M, n, u + t * p);
   S.M.x[n] = at.x;
@@ -992,6 +1048,7 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   buildCorners(S);
   buildStars(S);
   buildFreedom(S);
+  buildSheets(S);
 
   S.report.converged = untangleAndSmooth(S);
   if (S.report.converged && options.power > 1) liftWorst(S);

