@@ -148,6 +148,28 @@ TEST_SUITE("3.7.3") {
     CHECK(a.meanQ == doctest::Approx(b.meanQ).epsilon(1e-3));
   }
 
+  TEST_CASE("eq. (10), (11): the sides of a tangled box stay unfolded in every sweep") {
+    Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
+    unsigned random = 7;
+    auto shake = [&] { return .9 * ((random = random * 1664525u + 1013904223u) / 4294967296. - .5); };
+    for (std::size_t n = 0; n < M.x.size(); ++n)
+      if (M.dimension[n] == 3) M.x[n] += Vec3{shake(), shake(), shake()};  // up to 1.8 cells: tangled
+    CHECK(shapes::countInverted(M) > 0);
+    OptimizeOptions options;
+    options.onSweep = [&](const Sweep&) {
+      for (int p = 1; p <= 6; ++p) {
+        double area = 0;
+        for (const auto& face : surfaceFaces(M, -p)) {
+          Vec2 u[3];
+          for (int i = 0; i < 3; ++i) REQUIRE(parameterOn(M, face[i], -p, u[i]));
+          area += .5 * std::abs(cross(u[1] - u[0], u[2] - u[0]));
+        }
+        CHECK(area == doctest::Approx(1));  // more where triangles lie over each other
+      }
+    };
+    CHECK(optimizeMesh(M, options).inverted == 0);
+  }
+
   TEST_CASE("eq. (11): a node slides around a closed curve across s = 0") {
     // A ring of nodes of the plane z = .5 on a circle-like closed polygon, displaced along it.
     const int n = 6, points = 80;

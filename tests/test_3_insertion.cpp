@@ -221,6 +221,30 @@ TEST_SUITE("3") {
     insertAndCheck(unitBox(), samples::randomPatch(4), withSize(.12, InsertOptions::paper()));
   }
 
+  TEST_CASE("insertion: S_M ends unfolded in U, no rim node round a corner") {
+    for (double A : {.1, .2})
+      for (const InsertOptions& options : {withSize(.12), withSize(.12, InsertOptions::paper())}) {
+        Mesh M = unitBox();
+        insertSurface(M, samples::sine(A, 24), options);
+        int turns[2] = {0, 0};
+        for (std::size_t E = 0; E < M.tets.size(); ++E)
+          for (int i = 0; i < 4; ++i) {
+            if (M.faceLabel[E][i] != 1) continue;
+            constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+            const std::array<int, 4>& z = M.tets[E];
+            Vec2 u[3];
+            for (int k = 0; k < 3; ++k) REQUIRE(parameterOn(M, z[outward[i][k]], 1, u[k]));
+            const double volume = det(Mat3{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]});
+            const Vec3 middle = .25 * (M.x[z[0]] + M.x[z[1]] + M.x[z[2]] + M.x[z[3]]);
+            const bool above = middle.z > .5 + A * std::sin(2 * std::acos(-1.) * middle.x);
+            const double area = (volume > 0 ? 1 : -1) * cross(u[1] - u[0], u[2] - u[0]);
+            ++turns[(area > 0) == above];  // all faces turn one way, seen from one side of S
+          }
+        CHECK(std::min(turns[0], turns[1]) == 0);
+        CHECK(std::max(turns[0], turns[1]) > 200);
+      }
+  }
+
   TEST_CASE("insertion: S turned over gives a valid mesh as well") {
     TriangleSurface S = samples::sine(.1, 24);
     for (auto& t : S.triangles) std::swap(t[0], t[1]);
