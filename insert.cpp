@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: MIT
 //
-// Sections 2 to 3.6 of the paper: the box meccano and Kossaczký's bisection, volumetric approximation
-// and its healing, surface extraction and its healing, surface projection; and insertSurface, which
-// calls them in the paper's order. Section 3.7 is optimize.cpp.
-#include "meccano.hpp"
-
+// Sections 2 to 3.6 of the paper: the box meccano and Kossaczký's bisection, volumetric
+// approximation and its healing, surface extraction and its healing, surface projection; and
+// insertSurface, which calls them in the paper's order. Section 3.7 is optimize.cpp.
 #include <algorithm>
 #include <cstdint>
 #include <cstdio>
 #include <map>
 #include <numeric>
 #include <set>
+
+#include "meccano.hpp"
 
 namespace meccano {
 
@@ -85,7 +85,10 @@ int localIndex(const std::array<int, 4>& tet, int n) {
 namespace {
 
 /// The segment of a curve from point i to the next, and the part t of it, at arc length s.
-struct CurvePlace { int i, next; double t; };
+struct CurvePlace {
+  int i, next;
+  double t;
+};
 CurvePlace placeOn(const Curve& C, double s) {
   const double length = C.s.back();
   s = C.closed ? s - length * std::floor(s / length) : std::clamp(s, 0., length);
@@ -265,7 +268,8 @@ void addBoxCurves(Mesh& M, Vec3 origin, Vec3 size) {
           C.points.push_back(boxPoint(origin, size, corner, {1, 1, 1}));
         }
         C.s = {0, component(size, axis)};
-        // on the side normal to axis + 1, u = (axis + 2, axis); on the one normal to axis + 2, (axis, axis + 1)
+        // on the side normal to axis + 1, u = (axis + 2, axis); on the one normal to axis + 2,
+        // (axis, axis + 1)
         C.sides = {{-boxPatch((axis + 1) % 3, b), {{double(c), 0}, {double(c), 1}}},
                    {-boxPatch((axis + 2) % 3, c), {{0, double(b)}, {1, double(b)}}}};
         M.curves.push_back(C);
@@ -363,7 +367,8 @@ Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells) {
   M.cube = {size.x / cells[0], size.y / cells[1], size.z / cells[2]};
   const QualityStatistics q = qualityStatistics(M);
   if (q.inverted > 0 || !(q.min > 0))
-    throw InputError("boxMesh: origin and size leave no digits for the cells; move or scale the box");
+    throw InputError(
+        "boxMesh: origin and size leave no digits for the cells; move or scale the box");
   return M;
 }
 
@@ -383,7 +388,9 @@ std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
   for (int E = 0; E < count; ++E)
     for (int i = 0; i < 4; ++i) ++start[face(E, i)[0] + 1];
   std::partial_sum(start.begin(), start.end(), start.begin());
-  struct Waiting { int v1, v2, E, i; };
+  struct Waiting {
+    int v1, v2, E, i;
+  };
   std::vector<Waiting> group(start.back());
   std::vector<int> filled(start.begin(), start.end() - 1);
   for (int E = 0; E < count; ++E)
@@ -404,7 +411,8 @@ std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
   return neighbour;
 }
 
-Bisection::Bisection(Mesh& mesh) : M(mesh), neighbour(faceNeighbours(mesh)), tetOf(mesh.x.size(), -1) {
+Bisection::Bisection(Mesh& mesh)
+    : M(mesh), neighbour(faceNeighbours(mesh)), tetOf(mesh.x.size(), -1) {
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int n : M.tets[E]) tetOf[n] = static_cast<int>(E);
 }
@@ -478,28 +486,35 @@ void checkMeccano(const Mesh& M, const std::string& who) {
   auto refuse = [&](const std::string& what) { throw InputError(who + ": " + what); };
   if (tets == 0) refuse("the mesh has no tetrahedra");
   if (M.xi.size() != nodes)
-    refuse("the mesh has no computational coordinates, which bisection and projection need; make it by "
-           "boxMesh or `meccano box`, or read a meccano .vtk");
+    refuse(
+        "the mesh has no computational coordinates, which bisection and projection need; make it "
+        "by "
+        "boxMesh or `meccano box`, or read a meccano .vtk");
   if (M.type.size() != tets || M.level.size() != tets || M.faceLabel.size() != tets ||
       M.dimension.size() != nodes || M.entity.size() != nodes || M.parameter.size() != nodes)
-    refuse("the mesh lacks types, levels, labels or entities of some elements; make it by boxMesh, or "
-           "read a meccano .vtk");
+    refuse(
+        "the mesh lacks types, levels, labels or entities of some elements; make it by boxMesh, or "
+        "read a meccano .vtk");
   if (!(M.cube.x > 0 && M.cube.y > 0 && M.cube.z > 0) || !std::isfinite(norm(M.cube)))
     refuse("the edges of the mesh's cubes (Mesh::cube) must be finite and above 0");
-  const int patches = static_cast<int>(M.patches.size()), surfaces = static_cast<int>(M.surfaces.size());
+  const int patches = static_cast<int>(M.patches.size()),
+            surfaces = static_cast<int>(M.surfaces.size());
   for (std::size_t E = 0; E < tets; ++E)
     for (int i = 0; i < 4; ++i) {
       const int n = M.tets[E][i], label = M.faceLabel[E][i];
       if (n < 0 || n >= static_cast<int>(nodes) || M.type[E] > 2 || M.level[E] % 3 != M.type[E] ||
           label < -patches || label > surfaces)
-        refuse("tetrahedron " + std::to_string(E) + " has a node, type, level or label out of range");
+        refuse("tetrahedron " + std::to_string(E) +
+               " has a node, type, level or label out of range");
     }
-  const int counts[3] = {static_cast<int>(M.corners.size()), static_cast<int>(M.curves.size()), surfaces};
+  const int counts[3] = {static_cast<int>(M.corners.size()), static_cast<int>(M.curves.size()),
+                         surfaces};
   for (std::size_t n = 0; n < nodes; ++n) {
     const int dimension = M.dimension[n], entity = M.entity[n];
     const bool known = dimension == 3 || (dimension == 2 && entity < 0 && entity >= -patches) ||
                        (dimension < 3 && entity > 0 && entity <= counts[dimension]);
-    if (!known || !isFinite(M.x[n]) || !isFinite(M.xi[n]) || std::min({M.xi[n].x, M.xi[n].y, M.xi[n].z}) < 0)
+    if (!known || !isFinite(M.x[n]) || !isFinite(M.xi[n]) ||
+        std::min({M.xi[n].x, M.xi[n].y, M.xi[n].z}) < 0)
       refuse("node " + std::to_string(n) + " has an entity or a coordinate out of range");
   }
   const int curves = counts[1];
@@ -507,7 +522,8 @@ void checkMeccano(const Mesh& M, const std::string& who) {
     if (P.rim < 1 || P.rim > curves) refuse("surface '" + P.name + "' names no curve as its rim");
   for (const Corner& corner : M.corners)
     for (const Corner::Place& place : corner.on)
-      if (place.curve < 1 || place.curve > curves) refuse("a corner lies on a curve that is not there");
+      if (place.curve < 1 || place.curve > curves)
+        refuse("a corner lies on a curve that is not there");
 }
 
 /// s of node n on curve c.
@@ -539,7 +555,8 @@ int commonCurve(const Mesh& M, int a, int b, int label0, int label1) {
     std::vector<int> curves;
     if (M.dimension[n] == 1) curves.push_back(M.entity[n]);
     if (M.dimension[n] == 0)
-      for (const Corner::Place& place : M.corners[M.entity[n] - 1].on) curves.push_back(place.curve);
+      for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
+        curves.push_back(place.curve);
     return curves;
   };
   const std::vector<int> ofB = curvesOf(b);
@@ -557,8 +574,9 @@ int commonCurve(const Mesh& M, int a, int b, int label0, int label1) {
 
 }  // namespace
 
-/// The entity of the edge (a, b), told by the labels of the faces around it: two faces of one surface
-/// (inside it), one face of S_M (its rim), two of different patches (an edge of the boundary).
+/// The entity of the edge (a, b), told by the labels of the faces around it: two faces of one
+/// surface (inside it), one face of S_M (its rim), two of different patches (an edge of the
+/// boundary).
 Bisection::EdgeEntity Bisection::entityOf(int a, int b, const std::vector<int>& around) const {
   int patch[2] = {0, 0}, patches = 0, surface = 0, seen = 0;
   for (int t : around)
@@ -597,7 +615,8 @@ int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
   }
   if (e.dimension < 3 && dimension == 3)
     throw MethodError("bisect (§3.2): the edge of nodes " + std::to_string(a) + " and " +
-                      std::to_string(b) + " lies on a surface, its ends do not; the mesh's entities "
+                      std::to_string(b) +
+                      " lies on a surface, its ends do not; the mesh's entities "
                       "are inconsistent");
   M.x.push_back(x);
   M.xi.push_back(.5 * (M.xi[a] + M.xi[b]));
@@ -611,12 +630,15 @@ int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
 void Bisection::bisectRing(const std::vector<int>& around) {
   const int a = M.tets[around[0]][0], b = M.tets[around[0]][1];
   const int m = addMidpoint(a, b, around), first = static_cast<int>(M.tets.size());
-  // The child of ring tetrahedron t at end node `end`: child 0 keeps the index, child 1 is appended.
+  // The child of ring tetrahedron t at end node `end`: child 0 keeps the index, child 1 is
+  // appended.
   auto child = [&](int t, int end) {
     if (t < 0 || M.tets[t][0] == end) return t;
     return first + static_cast<int>(std::find(around.begin(), around.end(), t) - around.begin());
   };
-  struct Half { std::array<int, 4> z, neighbour, label; };
+  struct Half {
+    std::array<int, 4> z, neighbour, label;
+  };
   std::vector<Half> halves;
   for (int t : around) {
     const std::array<int, 4> z = M.tets[t], N = neighbour[t], L = M.faceLabel[t];
@@ -635,7 +657,8 @@ void Bisection::bisectRing(const std::vector<int>& around) {
     halves.push_back(one);
   }
   for (std::size_t i = 0; i < around.size(); ++i) {
-    const int t = around[i], t1 = first + static_cast<int>(i), beyond = halves[2 * i + 1].neighbour[3];
+    const int t = around[i], t1 = first + static_cast<int>(i),
+              beyond = halves[2 * i + 1].neighbour[3];
     if (beyond >= 0) *std::find(neighbour[beyond].begin(), neighbour[beyond].end(), t) = t1;
     tetOf[M.tets[t][1]] = t1;
     M.type[t] = static_cast<unsigned char>((M.type[t] + 1) % 3);
@@ -1250,9 +1273,11 @@ double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int sampl
 // ==== Tools for 3.2: triangle–tetrahedron intersection ===========================================
 
 bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle) {
-  constexpr double tolerance = 1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
+  constexpr double tolerance =
+      1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
   constexpr int faces[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
-  Vec3 polygon[16], clipped[16];  // three corners, one more for each plane; rounding on needles: twice that
+  Vec3 polygon[16],
+      clipped[16];  // three corners, one more for each plane; rounding on needles: twice that
   int corners = 3;
   for (int i = 0; i < 3; ++i) polygon[i] = triangle[i];
   for (int i = 0; i < 4; ++i) {
@@ -1342,7 +1367,8 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wa
 int cubeLevel(const Mesh& M, double lc) {
   constexpr int maxLevel = 240;  // levels fit in a byte
   int level = 0;
-  for (double diagonal = norm(M.cube); diagonal >= lc && level < maxLevel; diagonal /= 2) level += 3;
+  for (double diagonal = norm(M.cube); diagonal >= lc && level < maxLevel; diagonal /= 2)
+    level += 3;
   return level;
 }
 
@@ -1362,8 +1388,8 @@ Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, do
 
 namespace {
 
-/// The cubes of one level in the computational space. Keys are positions in half cubes: odd, odd, odd
-/// is a cube's centre; even, odd, odd a square's; even, even, even a node.
+/// The cubes of one level in the computational space. Keys are positions in half cubes: odd, odd,
+/// odd is a cube's centre; even, odd, odd a square's; even, even, even a node.
 struct Lattice {
   double scale;  // cubes per unit of ξ
   explicit Lattice(int level) : scale(std::ldexp(1., level / 3)) {}
@@ -1391,9 +1417,12 @@ struct Lattice {
     const Vec3 a = M.xi[face[0]], b = M.xi[face[1]], c = M.xi[face[2]];
     const Vec3 middle = (1. / 3) * (a + b + c);
     half = {inside(middle.x), inside(middle.y), inside(middle.z)};
-    if (a.x == b.x && a.x == c.x && onPlane(a.x)) return half[0] = std::int64_t(2 * a.x * scale), true;
-    if (a.y == b.y && a.y == c.y && onPlane(a.y)) return half[1] = std::int64_t(2 * a.y * scale), true;
-    if (a.z == b.z && a.z == c.z && onPlane(a.z)) return half[2] = std::int64_t(2 * a.z * scale), true;
+    if (a.x == b.x && a.x == c.x && onPlane(a.x))
+      return half[0] = std::int64_t(2 * a.x * scale), true;
+    if (a.y == b.y && a.y == c.y && onPlane(a.y))
+      return half[1] = std::int64_t(2 * a.y * scale), true;
+    if (a.z == b.z && a.z == c.z && onPlane(a.z))
+      return half[2] = std::int64_t(2 * a.z * scale), true;
     return false;
   }
 };
@@ -1444,8 +1473,8 @@ bool isLocalDisk(unsigned cubes) {
 
 namespace {
 
-/// Whole cubes: the neighbour across each boundary face of T that is not on the lattice's planes is refined
-/// to the same level and added. (There is one: ∂M lies on the lattice's planes.)
+/// Whole cubes: the neighbour across each boundary face of T that is not on the lattice's planes is
+/// refined to the same level and added. (There is one: ∂M lies on the lattice's planes.)
 void completeCubes(Bisection& B, Approximation& A, std::vector<int> queue) {
   const Lattice lattice(A.level);
   std::array<std::int64_t, 3> square;
@@ -1469,7 +1498,8 @@ std::vector<int> elementsOf(const std::vector<char>& T) {
   return elements;
 }
 
-/// For each lattice node of T the cubes of T around it: bit 1 x+, bit 2 y+, bit 4 z+ of the cube's place.
+/// For each lattice node of T the cubes of T around it: bit 1 x+, bit 2 y+, bit 4 z+ of the cube's
+/// place.
 KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint64_t>& nodes) {
   const Lattice lattice(A.level);
   KeyMap cubes, at;
@@ -1479,8 +1509,8 @@ KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint
     const std::array<std::int64_t, 3> p = Lattice::position(key);
     for (int c = 0; c < 8; ++c) {
       // seen from its corner at side c the cube lies on the other side
-      const std::uint64_t node = Lattice::key(
-          {p[0] + (c & 1 ? 1 : -1), p[1] + (c & 2 ? 1 : -1), p[2] + (c & 4 ? 1 : -1)});
+      const std::uint64_t node =
+          Lattice::key({p[0] + (c & 1 ? 1 : -1), p[1] + (c & 2 ? 1 : -1), p[2] + (c & 4 ? 1 : -1)});
       int& mask = at[node];
       if (mask == 0) nodes.push_back(node);
       mask |= 1 << (7 - c);
@@ -1530,8 +1560,9 @@ void volumetricHealing(Bisection& B, Approximation& A) {
     if (bad.empty()) return;
     for (int n : bad) {
       if (B.M.dimension[n] < 3)
-        throw MethodError("insertSurface (§3.3): T reaches the boundary or another surface at node " +
-                          std::to_string(n) + "; lower l_c");
+        throw MethodError(
+            "insertSurface (§3.3): T reaches the boundary or another surface at node " +
+            std::to_string(n) + "; lower l_c");
       addElementsAt(B, A, n);
     }
   }
@@ -1604,8 +1635,8 @@ void joinSquares(SquareSurface& Q) {
     }
 }
 
-/// Which diagonal of each square is an edge of the mesh: the longest edge of its faces. (Bisection reflects
-/// the cubes: it is not Kuhn's lowest to highest corner.)
+/// Which diagonal of each square is an edge of the mesh: the longest edge of its faces. (Bisection
+/// reflects the cubes: it is not Kuhn's lowest to highest corner.)
 void findDiagonals(const Mesh& M, const Approximation& A, SquareSurface& Q) {
   const Lattice lattice(A.level);
   KeyMap squareAt(Q.keys.size());
@@ -1635,8 +1666,7 @@ void collectNodes(SquareSurface& Q, int meshNodes) {
   Q.around.resize(Q.start.back());
   std::vector<int> next(Q.start.begin(), Q.start.end() - 1);
   for (std::size_t i = 0; i < Q.squares.size(); ++i)
-    for (int e = 0; e < 4; ++e)
-      Q.around[next[Q.squares[i].node[e]]++] = {static_cast<int>(i), e};
+    for (int e = 0; e < 4; ++e) Q.around[next[Q.squares[i].node[e]]++] = {static_cast<int>(i), e};
 }
 
 }  // namespace
@@ -1664,10 +1694,10 @@ SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
     for (int next : Q.squares[part[i]].across)
       if (!seen[next]) seen[next] = 1, part.push_back(next);
   if (euler != 2 || part.size() != Q.squares.size())
-    throw MethodError("insertSurface (§3.3): the boundary of T is no sphere (chi = " +
-                      std::to_string(euler) + ", " + std::to_string(part.size()) + " of " +
-                      std::to_string(Q.squares.size()) +
-                      " squares connected): S comes close to itself within l_c; lower l_c");
+    throw MethodError(
+        "insertSurface (§3.3): the boundary of T is no sphere (chi = " + std::to_string(euler) +
+        ", " + std::to_string(part.size()) + " of " + std::to_string(Q.squares.size()) +
+        " squares connected): S comes close to itself within l_c; lower l_c");
   return Q;
 }
 
@@ -1680,8 +1710,9 @@ struct Survey {
   std::vector<char> free;         // [squares], 0: touches another surface or the boundary
   std::vector<double> excess;     // [squares], tangential excess of the centre beyond the rim, in h
   std::vector<std::array<double, 4>> beyond;  // [squares], the same of the quarters
-  std::vector<std::array<double, 4>> above;   // [squares], distance from the rim of those above S, in h
-  std::vector<char> sharp;        // [mesh nodes], 1: the node nearest to a sharp corner of S
+  std::vector<std::array<double, 4>>
+      above;                // [squares], distance from the rim of those above S, in h
+  std::vector<char> sharp;  // [mesh nodes], 1: the node nearest to a sharp corner of S
 };
 
 Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
@@ -1734,18 +1765,22 @@ int largestPart(const std::vector<int>& sizes) {
 /// [choice] Keeps the largest edge-connected part of the selection and fills its holes.
 void keepLargestPart(const SquareSurface& Q, const Survey& survey, Selection& selected) {
   std::vector<int> sizes;
-  std::vector<int> part = connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
+  std::vector<int> part = connectedParts(
+      Q, [&](int i) { return selected[i] != 0; }, sizes);
   const int kept = largestPart(sizes);
   for (std::size_t i = 0; i < part.size(); ++i)
     if (part[i] != kept) selected[i] = emptySquare;
-  part = connectedParts(Q, [&](int i) { return selected[i] == 0; }, sizes);
+  part = connectedParts(
+      Q, [&](int i) { return selected[i] == 0; }, sizes);
   const int outside = largestPart(sizes);
   for (std::size_t i = 0; i < part.size(); ++i)
     if (part[i] > 0 && part[i] != outside && survey.free[i]) selected[i] = fullSquare;
 }
 
 /// The number of selected quarters at node n, and of rim edges there.
-struct NodeState { int quarters, rimEdges; };
+struct NodeState {
+  int quarters, rimEdges;
+};
 NodeState nodeState(const SquareSurface& Q, const Selection& selected, int n) {
   NodeState state{0, 0};
   for (int i = Q.start[n]; i < Q.start[n + 1]; ++i) {
@@ -1760,7 +1795,8 @@ NodeState nodeState(const SquareSurface& Q, const Selection& selected, int n) {
   return state;
 }
 
-/// [choice] At a pinch, a node with more than two rim edges, the square with the fewest selected neighbours goes.
+/// [choice] At a pinch, a node with more than two rim edges, the square with the fewest selected
+/// neighbours goes.
 bool cutPinches(const SquareSurface& Q, Selection& selected) {
   bool any = false;
   for (int n : Q.nodes) {
@@ -1779,10 +1815,11 @@ bool cutPinches(const SquareSurface& Q, Selection& selected) {
   return any;
 }
 
-/// [§3.4] The squares with all nodes on one side of S; one disk. [departure] Whole squares, where the paper
-/// selects triangles: S_M is then bounded by lattice edges, as §3.5 takes for granted.
+/// [§3.4] The squares with all nodes on one side of S; one disk. [departure] Whole squares, where
+/// the paper selects triangles: S_M is then bounded by lattice edges, as §3.5 takes for granted.
 Selection selectSquares(const SquareSurface& Q, const Survey& survey, int side) {
-  constexpr double maxExcess = .75;  // [choice] of h: squares farther beyond the rim are no candidates
+  constexpr double maxExcess =
+      .75;  // [choice] of h: squares farther beyond the rim are no candidates
   constexpr int maxRounds = 100;
   Selection selected(Q.squares.size(), emptySquare);
   for (std::size_t i = 0; i < Q.squares.size(); ++i) {
@@ -1808,7 +1845,7 @@ int chiOf(const SquareSurface& Q, const Selection& selected) {
       const int here = selected[i] >> e & 1, previous = selected[i] >> ((e + 3) % 4) & 1;
       const int there = selected[s.across[e]] >> s.acrossEdge[e] & 1;
       faces += here;
-      edges += here || previous;                                           // the spoke at corner e
+      edges += here || previous;                                       // the spoke at corner e
       edges += here && (!there || static_cast<int>(i) < s.across[e]);  // counted once
     }
   }
@@ -1818,7 +1855,8 @@ int chiOf(const SquareSurface& Q, const Selection& selected) {
 /// Empty where S_M is one disk; else what is wrong, for the message.
 std::string diskFault(const SquareSurface& Q, const Selection& selected) {
   std::vector<int> sizes;
-  connectedParts(Q, [&](int i) { return selected[i] != 0; }, sizes);
+  connectedParts(
+      Q, [&](int i) { return selected[i] != 0; }, sizes);
   if (sizes.size() == 1) return "it is empty";
   if (sizes.size() > 2) return "it has " + std::to_string(sizes.size() - 1) + " parts";
   for (int n : Q.nodes)
@@ -1866,15 +1904,14 @@ bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection&
   return any;
 }
 
-
 namespace {
 
-/// [§3.5 departure] Rim regularization: squares, whole or halved along a diagonal, are added and removed
-/// one or two at a time while the rim energy falls:
+/// [§3.5 departure] Rim regularization: squares, whole or halved along a diagonal, are added and
+/// removed one or two at a time while the rim energy falls:
 ///   E = Σ over rim nodes (1/16)(k − t)² + Σ over quarters ¼ (distance/h)²
-/// with k selected quarters at the node (of 45° each), t = 4 or at a sharp corner of S 2; the distance is
-/// the tangential excess of a selected quarter beyond the rim of S, or the distance from the rim of an
-/// unselected one above S.
+/// with k selected quarters at the node (of 45° each), t = 4 or at a sharp corner of S 2; the
+/// distance is the tangential excess of a selected quarter beyond the rim of S, or the distance
+/// from the rim of an unselected one above S.
 class RimRegularization {
  public:
   RimRegularization(const SquareSurface& Q, const Survey& survey, int side, Selection& selected)
@@ -1946,7 +1983,10 @@ class RimRegularization {
   }
 
   /// E and χ of what squares i and j (or i alone, j < 0) touch.
-  struct Local { double E; int chi; };
+  struct Local {
+    double E;
+    int chi;
+  };
   Local local(int i, int j) const {
     Local sum{0, 0};
     for (int square : {i, j}) {
@@ -1955,7 +1995,8 @@ class RimRegularization {
       sum.E += squareEnergy(square);
       sum.chi += selected_[square] != 0;  // the centre
       for (int e = 0; e < 4; ++e) {
-        const int here = selected_[square] >> e & 1, previous = selected_[square] >> ((e + 3) % 4) & 1;
+        const int here = selected_[square] >> e & 1,
+                  previous = selected_[square] >> ((e + 3) % 4) & 1;
         sum.chi += here - (here || previous);  // quarter and spoke
         if (square != j || s.across[e] != i) sum.chi -= here || quarterAcross(square, e);
         if (square == j && isCorner(i, s.node[e])) continue;
@@ -1990,7 +2031,8 @@ class RimRegularization {
     return false;
   }
 
-  /// Tries the states of square i alone, then with each of its neighbours; keeps the best that is better.
+  /// Tries the states of square i alone, then with each of its neighbours; keeps the best that is
+  /// better.
   bool improve(int i) {
     if (tryStates(i, -1)) return true;
     bool improved = false;
@@ -2070,8 +2112,8 @@ void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistan
 
 }  // namespace
 
-Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
-                             Outline outline) {
+Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                             int side, Outline outline) {
   constexpr int maxRounds = 50;
   Survey survey = surveySquares(M, Q, S);
   markSharpCorners(M, Q, S, side, survey);
@@ -2108,8 +2150,8 @@ int quarterOf(const Mesh& M, const SquareSurface& Q, int square, std::array<int,
 
 }  // namespace
 
-void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A, const Selection& selected,
-                  int k) {
+void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
+                  const Selection& selected, int k) {
   Mesh& M = B.M;
   const Lattice lattice(Q.level);
   KeyMap squareAt(Q.keys.size());
@@ -2148,8 +2190,8 @@ namespace {
 
 /// S_M as a complex: its nodes, edges and rim, read off the labelled faces.
 struct SurfaceComplex {
-  std::vector<char> node;                          // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
-  KeyMap edges;                                    // edge → times seen (twice a face): 2 rim, 4 inside
+  std::vector<char> node;  // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
+  KeyMap edges;            // edge → times seen (twice a face): 2 rim, 4 inside
   std::vector<std::pair<int, int>> edgeList;
   SurfaceComplex(const Mesh& M, int k) : node(M.x.size(), 0) {
     for (std::size_t E = 0; E < M.tets.size(); ++E)
@@ -2158,7 +2200,8 @@ struct SurfaceComplex {
         const std::array<int, 3> v = faceOpposite(M.tets[E], i);
         for (int e = 0; e < 3; ++e) {
           node[v[e]] = 1;
-          if (edges[edgeKey(v[e], v[(e + 1) % 3])]++ == 0) edgeList.push_back({v[e], v[(e + 1) % 3]});
+          if (edges[edgeKey(v[e], v[(e + 1) % 3])]++ == 0)
+            edgeList.push_back({v[e], v[(e + 1) % 3]});
         }
       }
     for (const auto& [a, b] : edgeList)
@@ -2612,7 +2655,8 @@ int middleOfLongestArc(const std::vector<double>& s, std::vector<int> chosen) {
 }  // namespace
 
 void splitChords(TriangleSurface& S) {
-  constexpr int maxRounds = 64;  // a chord's new point is inside: one round, two where the rim had three points
+  constexpr int maxRounds =
+      64;  // a chord's new point is inside: one round, two where the rim had three points
   for (int round = 0; round < maxRounds && splitChordsOnce(S) > 0; ++round) {
   }
 }
@@ -2916,7 +2960,7 @@ constexpr int maxRings = 63;
 
 /// Takes the anchors of the points of the triangles and of `rings` rings of triangles around away.
 void weakenAnchors(const TriangleSurface& S, const std::vector<int>& triangles, int rings,
-                    std::vector<double>& mu) {
+                   std::vector<double>& mu) {
   std::vector<char> marked(S.points.size(), 0);
   for (int t : triangles)
     for (int n : S.triangles[t]) marked[n] = 1;
@@ -3068,13 +3112,12 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   for (const Parametrization& earlier : M.surfaces) {
     const Gap between = smallestGap(S.tree, earlier.points, earlier.triangles);
     if (between.distance <= 0)
-      throw InputError("insertSurface (§3.1): S touches the inserted surface '" + earlier.name + "'" +
-                       at(between) + "; surfaces must not meet");
+      throw InputError("insertSurface (§3.1): S touches the inserted surface '" + earlier.name +
+                       "'" + at(between) + "; surfaces must not meet");
     if (!(lc < between.distance))
-      throw InputError("insertSurface (§3.2): l_c = " + number(lc) +
-                       " is not below the distance " + number(between.distance) +
-                       " to the inserted surface '" + earlier.name + "'" + at(between) +
-                       "; lower l_c");
+      throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below the distance " +
+                       number(between.distance) + " to the inserted surface '" + earlier.name +
+                       "'" + at(between) + "; lower l_c");
   }
 }
 
@@ -3087,13 +3130,14 @@ void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) 
   const double h = halving * std::cbrt(M.cube.x * M.cube.y * M.cube.z);
   double area = 0, farthest = 0, extent = 0;
   for (const auto& t : S.S.triangles)
-    area += .5 * norm(cross(S.S.points[t[1]] - S.S.points[t[0]], S.S.points[t[2]] - S.S.points[t[0]]));
+    area +=
+        .5 * norm(cross(S.S.points[t[1]] - S.S.points[t[0]], S.S.points[t[2]] - S.S.points[t[0]]));
   for (const Vec3& p : S.S.points) extent = std::max(extent, norm(p - S.S.points[S.rim[0]]));
   for (const Vec3& xi : M.xi) farthest = std::max({farthest, xi.x, xi.y, xi.z});
   if (extent < 2 * h)
     throw InputError("insertSurface (§3.2): S, of extent " + number(extent) +
-                     ", is smaller than two cubes of edge " + number(h) + " that l_c = " + number(lc) +
-                     " gives; lower l_c to " + number(.5 * lc * extent / (2 * h)));
+                     ", is smaller than two cubes of edge " + number(h) + " that l_c = " +
+                     number(lc) + " gives; lower l_c to " + number(.5 * lc * extent / (2 * h)));
   const double predicted = static_cast<double>(M.tets.size()) + tetsPerSquare * area / (h * h);
   if (predicted > maxTets)
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " asks for about " +
@@ -3105,18 +3149,22 @@ void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) 
 }
 
 /// One way to insert S: a side, and how the outline of S_M is made.
-struct Way { int side; Outline outline; Extraction extraction; };
+struct Way {
+  int side;
+  Outline outline;
+  Extraction extraction;
+};
 
 /// The state of an insertion, from the copy of the caller's mesh on.
 struct Insertion {
   const SurfaceDistance& S;
   const InsertOptions& options;
-  int k;                  // number of the new surface
-  Mesh M = {};            // refined by §3.2 and §3.3
+  int k;        // number of the new surface
+  Mesh M = {};  // refined by §3.2 and §3.3
   Approximation A = {};
   SquareSurface Q = {};
-  int ways = 0;           // tried so far, over all l_c
-  int faults = 0;         // and left; why the last one was, without prefix and advice
+  int ways = 0;    // tried so far, over all l_c
+  int faults = 0;  // and left; why the last one was, without prefix and advice
   std::string reason = {};
 
   void stage(const char* name, const Mesh& mesh) const {
@@ -3148,7 +3196,8 @@ std::vector<Way> extractWays(Insertion& I, Outline outline) {
     if (way.extraction.fault.empty())
       ways.push_back(std::move(way));
     else
-      I.leave(describe(way), MethodError("insertSurface (§3.4): S_M is no disk, " + way.extraction.fault));
+      I.leave(describe(way),
+              MethodError("insertSurface (§3.4): S_M is no disk, " + way.extraction.fault));
   }
   if (ways.size() == 2 && ways[1].extraction.energy < ways[0].extraction.energy)
     std::swap(ways[0], ways[1]);
@@ -3179,8 +3228,9 @@ void releaseCorner(Mesh& M, int n, int k) {
     }
 }
 
-/// §3.7, and [departure] where a few elements stay inverted: their corners are released, they are bisected
-/// for more freedom, as long as their number falls. No global descent here: other ways of inserting S are cheaper.
+/// §3.7, and [departure] where a few elements stay inverted: their corners are released, they are
+/// bisected for more freedom, as long as their number falls. No global descent here: other ways of
+/// inserting S are cheaper.
 void optimizeAround(Bisection& B, const Insertion& I, InsertReport& report) {
   constexpr int maxRounds = 4, fewInverted = 60;
   OptimizeOptions optimize = I.options.optimize;
@@ -3251,7 +3301,8 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
-                      number(report.hausdorff) + ", above half of l_c: S has a part narrower than "
+                      number(report.hausdorff) +
+                      ", above half of l_c: S has a part narrower than "
                       "the cubes");
   if (report.hausdorff > poorHausdorff * report.lc)
     report.warnings.push_back("the Hausdorff distance S_M - S, " + number(report.hausdorff) +
@@ -3281,7 +3332,8 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
     report = ofThisWay, result = std::move(trial);
 }
 
-/// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and report.
+/// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
+/// report.
 void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, InsertReport& report) {
   constexpr double goodQuality = .6;  // [choice] min q below which the other ways are tried too
   I.M = M;
@@ -3319,7 +3371,8 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
   InsertReport report;
   report.original = qualityStatistics(M);
   if (report.original.inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(report.original.inverted) +
+    throw InputError("insertSurface (§3.1): the mesh has " +
+                     std::to_string(report.original.inverted) +
                      " inverted elements; untangle it first (optimizeMesh)");
   std::vector<std::string> warnings;
   TriangleSurface disk = checkSurface(S, warnings);

@@ -6,8 +6,6 @@
 //   VTK legacy       meshes out and in, with all that a later insertion needs
 //   Commands         box, insert, optimize, stats
 //   Arguments        options, help, exit status: 0 done and valid, 1 an error, 2 wrong usage
-#include "meccano.hpp"
-
 #include <unistd.h>
 
 #include <algorithm>
@@ -23,6 +21,8 @@
 #include <memory>
 #include <new>
 #include <string_view>
+
+#include "meccano.hpp"
 
 namespace meccano::app {
 
@@ -123,7 +123,9 @@ void checkWritable(const std::string& path) {
   if (!isDevice(path)) Temporary probe(path);
 }
 
-struct Output { std::string path, text; };
+struct Output {
+  std::string path, text;
+};
 
 /// Writes all or none: each file beside its target first, renamed when every one is complete.
 void writeFiles(const std::vector<Output>& outputs) {
@@ -816,8 +818,7 @@ bool readAttribute(Scanner& in, const std::string& key, Arrays& to, int count) {
     readArray(in, name, 4, in.count("colours of a table"));
     return true;
   }
-  if (key == "COLOR_SCALARS" || key == "TEXTURE_COORDINATES")
-    components = in.count("components");
+  if (key == "COLOR_SCALARS" || key == "TEXTURE_COORDINATES") components = in.count("components");
   if (key != "COLOR_SCALARS") in.word("the type of an attribute");
   if (key == "SCALARS") {
     std::string next = upper(in.word("LOOKUP_TABLE"));
@@ -834,8 +835,9 @@ bool readAttribute(Scanner& in, const std::string& key, Arrays& to, int count) {
 void readHead(Scanner& in) {
   if (in.atEnd()) in.failAsWhole("the file is empty; a VTK legacy mesh is needed");
   if (in.line().substr(0, 14) != "# vtk DataFile")
-    in.failAsWhole("this is no VTK legacy file (no '# vtk DataFile' in the first line); meshes are "
-                   "read from .vtk files");
+    in.failAsWhole(
+        "this is no VTK legacy file (no '# vtk DataFile' in the first line); meshes are "
+        "read from .vtk files");
   in.line();
   const std::string coding = upper(in.word("ASCII"));
   if (coding == "BINARY")
@@ -948,7 +950,10 @@ void orderForBisection(Mesh& M, const Scanner& in) {
 void labelFaces(const VtkFile& file, Mesh& M, const Scanner& in) {
   constexpr int triangle = 5;
   using Key = std::array<int, 3>;
-  struct Labelled { Key key; int label, uses; };
+  struct Labelled {
+    Key key;
+    int label, uses;
+  };
   std::vector<Labelled> faces;
   Unpacking surface(file.cellData, "surface", 1, in);
   std::vector<char> used(M.x.size(), 0);
@@ -1052,7 +1057,9 @@ Mesh readMesh(const std::string& path) {
 // ==== Arguments =================================================================================
 
 /// Wrong usage: exit status 2.
-struct UsageError : std::runtime_error { using std::runtime_error::runtime_error; };
+struct UsageError : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
 
 /// Standard output for results, standard error for progress and errors.
 struct Streams {
@@ -1125,7 +1132,10 @@ class Progress {
   bool quiet_, sweeping_ = false;
 };
 
-struct Column { const char* head; const QualityStatistics* q; };
+struct Column {
+  const char* head;
+  const QualityStatistics* q;
+};
 
 /// Table I: a column for each mesh.
 std::string tableI(const std::vector<Column>& columns) {
@@ -1136,8 +1146,10 @@ std::string tableI(const std::vector<Column>& columns) {
   text += format("\n%-12s", "inverted");
   for (const Column& c : columns) text += format("%14d", c.q->inverted);
   const std::pair<const char*, double QualityStatistics::*> rows[] = {
-      {"min", &QualityStatistics::min}, {"max", &QualityStatistics::max},
-      {"mean", &QualityStatistics::mean}, {"std dev", &QualityStatistics::stdDev}};
+      {"min", &QualityStatistics::min},
+      {"max", &QualityStatistics::max},
+      {"mean", &QualityStatistics::mean},
+      {"std dev", &QualityStatistics::stdDev}};
   for (const auto& [name, member] : rows) {
     text += format("\n%-12s", name);
     for (const Column& c : columns) text += format("%14.4f", c.q->*member);
@@ -1146,8 +1158,10 @@ std::string tableI(const std::vector<Column>& columns) {
 }
 
 std::string regularLine(const QualityStatistics& q) {
-  return format("against the regular tetrahedron: inverted %d, min %.4f, max %.4f, mean %.4f, "
-                "std dev %.4f\n", q.inverted, q.min, q.max, q.mean, q.stdDev);
+  return format(
+      "against the regular tetrahedron: inverted %d, min %.4f, max %.4f, mean %.4f, "
+      "std dev %.4f\n",
+      q.inverted, q.min, q.max, q.mean, q.stdDev);
 }
 
 std::string sizeOf(const Mesh& M) {
@@ -1170,23 +1184,29 @@ void runBox(const Arguments& a, const Streams& io) {
 /// What insertion needs of a mesh that was read.
 void checkInsertable(const std::string& path, const Mesh& M) {
   if (M.xi.empty())
-    fail(path + ": the mesh has no computational coordinates, and bisection needs them; start from "
+    fail(path +
+         ": the mesh has no computational coordinates, and bisection needs them; start from "
          "`meccano box` or a .vtk file that meccano wrote");
   int highest = 0;
   for (const std::array<int, 4>& labels : M.faceLabel)
     for (int label : labels) highest = std::max(highest, label);
   if (highest > static_cast<int>(M.surfaces.size()))
-    fail(path + ": surface " + std::to_string(highest) + " is marked in it without its geometry, "
+    fail(path + ": surface " + std::to_string(highest) +
+         " is marked in it without its geometry, "
          "as in the stages of an insertion; insert into a finished mesh");
 }
 
 void printInsertion(const InsertReport& r, const std::string& name, const Streams& io) {
-  io.out << tableI({{"original", &r.original}, {"refined", &r.refined},
-                    {"projected", &r.projected}, {"smoothed", &r.smoothed}})
+  io.out << tableI({{"original", &r.original},
+                    {"refined", &r.refined},
+                    {"projected", &r.projected},
+                    {"smoothed", &r.smoothed}})
          << regularLine(r.regular)
-         << format("surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
-                   "%.3g, Hausdorff distance %.3g\n", r.surface, name.c_str(), r.lc, r.nodes,
-                   r.triangles, r.maxNodeDistance, r.hausdorff);
+         << format(
+                "surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
+                "%.3g, Hausdorff distance %.3g\n",
+                r.surface, name.c_str(), r.lc, r.nodes, r.triangles, r.maxNodeDistance,
+                r.hausdorff);
 }
 
 InsertOptions insertOptions(const Arguments& a) {
@@ -1197,8 +1217,8 @@ InsertOptions insertOptions(const Arguments& a) {
   return o;
 }
 
-/// The files of --stages PREFIX. Stages come once for each way of inserting that is tried; those of the
-/// way that was taken are written.
+/// The files of --stages PREFIX. Stages come once for each way of inserting that is tried; those of
+/// the way that was taken are written.
 struct Stages {
   std::string prefix;  // empty: none are kept
   int way = 0;
@@ -1320,40 +1340,57 @@ struct Command {
 
 constexpr Option outputOption{"-o", "OUT.vtk", "the mesh to write"};
 constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
-constexpr Option powerOption{"--power", "P",
-                             "exponent of the term that lifts the worst elements (default 48; 1: none)"};
+constexpr Option powerOption{
+    "--power", "P", "exponent of the term that lifts the worst elements (default 48; 1: none)"};
 constexpr Option quietOption{"--quiet", "", "no progress on standard error"};
 
 const std::vector<Command>& commands() {
   static const std::vector<Command> all{
-      {"box", "", "Makes the tetrahedral mesh of a box: six Kuhn tetrahedra for each cell.", 0, 0,
+      {"box",
+       "",
+       "Makes the tetrahedral mesh of a box: six Kuhn tetrahedra for each cell.",
+       0,
+       0,
        {outputOption,
         {"--origin", "X Y Z", "lowest corner (default 0 0 0)"},
         {"--size", "X Y Z", "edge lengths (default 1 1 1)"},
         {"--cells", "NX NY NZ", "cells along each axis, near-cubic ones are best (default 1 1 1)"}},
        runBox},
-      {"insert", "MESH.vtk SURFACE.obj",
+      {"insert",
+       "MESH.vtk SURFACE.obj",
        "Inserts a triangulated surface into a mesh that meccano wrote, and prints Table I: the\n"
        "quality of the original, refined, projected and smoothed mesh, against its computational\n"
-       "elements.", 2, 1000,
+       "elements.",
+       2,
+       1000,
        {outputOption,
         {"--lc", "L", "element size at the surface, eq. (1), in the unit of the input"},
-        paperOption, powerOption,
+        paperOption,
+        powerOption,
         {"--stages", "PREFIX", "also write PREFIX-{original,refined,projected,smoothed}.vtk"},
         {"--max-tets", "N", "refuse where more tetrahedra are predicted (default 20000000)"},
         quietOption},
        runInsert},
-      {"optimize", "MESH.vtk",
+      {"optimize",
+       "MESH.vtk",
        "Untangles and smooths a tetrahedral mesh, Algorithm 2. The ideal elements are the\n"
        "computational ones where the file has them; else regular, and the boundary stays in place.",
-       1, 1,
+       1,
+       1,
        {outputOption,
         {"--max-disp", "D", "stop below this displacement / shortest edge (default .01)"},
         {"--max-sweeps", "N", "stop after this many sweeps (default 300)"},
-        paperOption, powerOption, quietOption},
+        paperOption,
+        powerOption,
+        quietOption},
        runOptimize},
-      {"stats", "MESH.vtk", "Prints the quality statistics of a tetrahedral mesh, as in Table I.",
-       1, 1, {}, runStats}};
+      {"stats",
+       "MESH.vtk",
+       "Prints the quality statistics of a tetrahedral mesh, as in Table I.",
+       1,
+       1,
+       {},
+       runStats}};
   return all;
 }
 
@@ -1407,8 +1444,8 @@ Arguments parseArguments(const Command& c, const std::vector<std::string>& words
   }
   if (a.operands.size() < c.least || a.operands.size() > c.most)
     throw UsageError(c.most == 0 ? "'" + a.operands[0] + "' is too much, no file is read"
-                                 : std::string("needed: ") + c.operands + ", given: " +
-                                       std::to_string(a.operands.size()) + " files");
+                                 : std::string("needed: ") + c.operands +
+                                       ", given: " + std::to_string(a.operands.size()) + " files");
   return a;
 }
 
@@ -1444,8 +1481,9 @@ int run(const std::vector<std::string>& words, const Streams& io) {
     if (io.out) return 0;
     io.err << "meccano: the results cannot be written to standard output" << std::endl;
   } catch (const UsageError& e) {
-    const bool known = !words.empty() && words[0][0] != '-' && std::any_of(commands().begin(),
-        commands().end(), [&](const Command& c) { return words[0] == c.name; });
+    const bool known = !words.empty() && words[0][0] != '-' &&
+                       std::any_of(commands().begin(), commands().end(),
+                                   [&](const Command& c) { return words[0] == c.name; });
     io.err << "meccano: " << (known ? words[0] + ": " : "") << e.what() << "; see meccano "
            << (known ? words[0] + " " : "") << "--help" << std::endl;
     return 2;

@@ -11,10 +11,11 @@
 //            catch meccano::Error (your mesh is then what it was).
 //
 // Limits: at most 5e8 tetrahedra; surfaces are disks with a rim, and touch neither
-// each other nor the boundary. The library never prints, opens a file, reads the clock, draws random
-// numbers or keeps global state: the same input gives the same bytes.
+// each other nor the boundary. The library never prints, opens a file, reads the clock, draws
+// random numbers or keeps global state: the same input gives the same bytes.
 //
-// Tags:   [§…, eq. (…)] what the code implements · [choice] the paper is silent · [departure] we differ
+// Tags:   [§…, eq. (…)] what the code implements · [choice] the paper is silent · [departure] we
+// differ
 #ifndef MECCANO_HPP
 #define MECCANO_HPP
 
@@ -35,16 +36,30 @@ inline constexpr const char* version = "0.1.0";
 // ==== Errors ====================================================================================
 // The message says what, where and what to do. One catch of Error gets all.
 
-struct Error : std::runtime_error { using std::runtime_error::runtime_error; };
-struct InputError : Error { using Error::Error; };   // the data break §3.1, or a file is malformed
-struct MethodError : Error { using Error::Error; };  // a step cannot reach what it promises
-struct SolverError : Error { using Error::Error; };  // a linear solve did not converge
+struct Error : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+struct InputError : Error {
+  using Error::Error;
+};  // the data break §3.1, or a file is malformed
+struct MethodError : Error {
+  using Error::Error;
+};  // a step cannot reach what it promises
+struct SolverError : Error {
+  using Error::Error;
+};  // a linear solve did not converge
 
 // ==== Algebra ===================================================================================
 
-struct Vec2 { double x = 0, y = 0; };
-struct Vec3 { double x = 0, y = 0, z = 0; };
-struct Mat3 { Vec3 c0, c1, c2; };  // by columns
+struct Vec2 {
+  double x = 0, y = 0;
+};
+struct Vec3 {
+  double x = 0, y = 0, z = 0;
+};
+struct Mat3 {
+  Vec3 c0, c1, c2;
+};  // by columns
 
 inline Vec2 operator+(Vec2 a, Vec2 b) { return {a.x + b.x, a.y + b.y}; }
 inline Vec2 operator-(Vec2 a, Vec2 b) { return {a.x - b.x, a.y - b.y}; }
@@ -65,12 +80,16 @@ inline Vec3 cross(Vec3 a, Vec3 b) {
 }
 inline double norm2(Vec3 a) { return dot(a, a); }
 inline double norm(Vec3 a) { return std::sqrt(norm2(a)); }
-inline bool isFinite(Vec3 a) { return std::isfinite(a.x) && std::isfinite(a.y) && std::isfinite(a.z); }
+inline bool isFinite(Vec3 a) {
+  return std::isfinite(a.x) && std::isfinite(a.y) && std::isfinite(a.z);
+}
 
 inline Vec3 operator*(const Mat3& A, Vec3 v) { return v.x * A.c0 + v.y * A.c1 + v.z * A.c2; }
 inline Mat3 operator*(const Mat3& A, const Mat3& B) { return {A * B.c0, A * B.c1, A * B.c2}; }
 inline Mat3 operator*(double t, const Mat3& A) { return {t * A.c0, t * A.c1, t * A.c2}; }
-inline Mat3 operator+(const Mat3& A, const Mat3& B) { return {A.c0 + B.c0, A.c1 + B.c1, A.c2 + B.c2}; }
+inline Mat3 operator+(const Mat3& A, const Mat3& B) {
+  return {A.c0 + B.c0, A.c1 + B.c1, A.c2 + B.c2};
+}
 inline Mat3 outer(Vec3 a, Vec3 b) { return {b.x * a, b.y * a, b.z * a}; }  // a bᵀ
 inline Mat3 transpose(const Mat3& A) {
   return {{A.c0.x, A.c1.x, A.c2.x}, {A.c0.y, A.c1.y, A.c2.y}, {A.c0.z, A.c1.z, A.c2.z}};
@@ -101,10 +120,11 @@ struct Parametrization {
   std::vector<std::array<int, 3>> triangles;  // [triangles], counter-clockwise in 𝓤
   std::vector<Vec2> u;                        // [points], in 𝓤 (the unit square)
   std::string name = {};
-  int rim = 0;                                // number of its rim among Mesh::curves; 0: a boundary patch
+  int rim = 0;  // number of its rim among Mesh::curves; 0: a boundary patch
   // Uniform grid over 𝓤 for the point location; derived data, made by buildLocator().
   int gridSize = 0;
-  std::vector<int> gridStart, gridTriangles;  // triangles of cell c: gridTriangles[gridStart[c] .. gridStart[c+1])
+  // Triangles of cell c: gridTriangles[gridStart[c] .. gridStart[c+1]).
+  std::vector<int> gridStart, gridTriangles;
 };
 
 /// [§3.7.3] A curve γ(s) by arc length: the rim of an inserted surface, or an edge of the boundary.
@@ -112,14 +132,21 @@ struct Curve {
   std::vector<Vec3> points;  // [points], along the curve
   std::vector<double> s;     // [points], arc length; a closed curve has one more entry, its length
   bool closed = false;       // true: points.back() is joined to points.front(), s is periodic
-  struct Side { int surface; std::vector<Vec2> u; };
-  std::vector<Side> sides;   // each surface (label as in Mesh::faceLabel) the curve bounds, with u at the points
+  struct Side {
+    int surface;
+    std::vector<Vec2> u;
+  };
+  // each surface (label as in Mesh::faceLabel) the curve bounds, with u at the points
+  std::vector<Side> sides;
 };
 
 /// A fixed point of the geometry: a corner of the domain, or a sharp corner of a rim.
 struct Corner {
   Vec3 x;
-  struct Place { int curve; double s; };
+  struct Place {
+    int curve;
+    double s;
+  };
   std::vector<Place> on;  // the curves through it (numbers as in Mesh::entity)
 };
 
@@ -127,21 +154,23 @@ struct Corner {
 /// Numbers of surfaces, patches, curves and corners start at 1, as in the file. A mesh that is only
 /// to be optimized needs x and tets; it then counts as one without geometry (boundary fixed).
 struct Mesh {
-  std::vector<Vec3> x;                   // physical nodes, [nodes], length unit of the input
-  std::vector<Vec3> xi;                  // computational nodes, [nodes], cubes of edge 1; empty: none
+  std::vector<Vec3> x;   // physical nodes, [nodes], length unit of the input
+  std::vector<Vec3> xi;  // computational nodes, [nodes], cubes of edge 1; empty: none
   std::vector<std::array<int, 4>> tets;  // [tets], bisection order: z0 z1 is the refinement edge
   std::vector<unsigned char> type;       // [tets], 0 1 2 of Kossaczký's method
   std::vector<unsigned char> level;      // [tets], bisections since the cube; level mod 3 = type
-  // [tets], label of the face opposite to each vertex: 0 none, k > 0 inserted surface k, -p boundary patch p
+  // [tets], label of the face opposite to each vertex: 0 none, k > 0 inserted surface k, -p
+  // boundary patch p
   std::vector<std::array<int, 4>> faceLabel;
-  std::vector<unsigned char> dimension;  // [nodes], 3 inside, 2 on a surface, 1 on a curve, 0 a corner
-  std::vector<int> entity;               // [nodes], 0; label k or -p; number of the curve; of the corner
-  std::vector<Vec2> parameter;           // [nodes], (0,0); u; (s,0); (0,0)
-  std::vector<Parametrization> surfaces; // inserted surface k is surfaces[k-1]
-  std::vector<Parametrization> patches;  // boundary patch p is patches[p-1]
-  std::vector<Curve> curves;             // curve c is curves[c-1]
-  std::vector<Corner> corners;           // corner c is corners[c-1]
-  Vec3 cube{1, 1, 1};                    // physical edge lengths of an undeformed cube of level 0
+  // [nodes], 3 inside, 2 on a surface, 1 on a curve, 0 a corner
+  std::vector<unsigned char> dimension;
+  std::vector<int> entity;      // [nodes], 0; label k or -p; number of the curve; of the corner
+  std::vector<Vec2> parameter;  // [nodes], (0,0); u; (s,0); (0,0)
+  std::vector<Parametrization> surfaces;  // inserted surface k is surfaces[k-1]
+  std::vector<Parametrization> patches;   // boundary patch p is patches[p-1]
+  std::vector<Curve> curves;              // curve c is curves[c-1]
+  std::vector<Corner> corners;            // corner c is corners[c-1]
+  Vec3 cube{1, 1, 1};                     // physical edge lengths of an undeformed cube of level 0
 };
 
 /// Table I: the number of inverted elements and the statistics of q over all.
@@ -155,18 +184,25 @@ struct QualityStatistics {
 // ==== Options and reports =======================================================================
 
 /// One sweep of Algorithm 2, for a progress display.
-struct Sweep { int number, inverted; double minQ, disp; };
+struct Sweep {
+  int number, inverted;
+  double minQ, disp;
+};
 
 struct OptimizeOptions {
-  double maxDisp = 1e-2;   // Algorithm 2's maxDisp, relative to the node's shortest edge; > 0
-  int maxSweeps = 300;     // bound of Algorithm 2's loop; >= 1
-  // [§3.7.4 departure] Once valid and converged, the worst 1 % of the elements are lifted by Σ η + (η/η_w)^power.
-  double power = 48;       // [1, 64], 1: none
+  double maxDisp = 1e-2;  // Algorithm 2's maxDisp, relative to the node's shortest edge; > 0
+  int maxSweeps = 300;    // bound of Algorithm 2's loop; >= 1
+  // [§3.7.4 departure] Once valid and converged, the worst 1 % of the elements are lifted by Σ η +
+  // (η/η_w)^power.
+  double power = 48;                  // [1, 64], 1: none
   bool numericalDerivatives = false;  // §3.7.3: derivatives in u and s by differences, as printed
-  int maxTangledSweeps = 60;  // most meshes are valid after 20; then [departure] the global descent, if wanted
-  bool globalDescent = true;  // [departure] all nodes at once, for states that no single node can leave
-  double mu = 8e-3;        // h(σ_min) that δ gives, relative to the mean σ; (0, 1)
-  double relaxation = 1.6; // [§3.7.4 departure] first trial step, in Newton steps; [1, 2), 1: as printed
+  // most meshes are valid after 20; then [departure] the global descent, if wanted
+  int maxTangledSweeps = 60;
+  // [departure] all nodes at once, for states that no single node can leave
+  bool globalDescent = true;
+  double mu = 8e-3;  // h(σ_min) that δ gives, relative to the mean σ; (0, 1)
+  // [§3.7.4 departure] first trial step, in Newton steps; [1, 2), 1: as printed
+  double relaxation = 1.6;
   std::vector<int> fixed = {};   // nodes that stay where they are, besides the corners
   std::vector<int> active = {};  // nodes visited in the first sweep; empty: all
   std::function<void(const Sweep&)> onSweep = nullptr;  // called after each sweep
@@ -175,25 +211,26 @@ struct OptimizeOptions {
 };
 
 struct OptimizeReport {
-  int sweeps = 0;         // of all phases
-  double disp = 0;        // of Algorithm 2's last sweep (before the worst elements), as maxDisp
-  bool converged = false; // valid and disp <= maxDisp before maxSweeps
-  int inverted = 0;       // elements with σ <= 0 left
+  int sweeps = 0;          // of all phases
+  double disp = 0;         // of Algorithm 2's last sweep (before the worst elements), as maxDisp
+  bool converged = false;  // valid and disp <= maxDisp before maxSweeps
+  int inverted = 0;        // elements with σ <= 0 left
   double minQ = 0, meanQ = 0;
 };
 
-/// [§3.5] How the outline of S_M is healed: by cases 1 and 2, or [departure] by rim regularization with whole
-/// squares, or with half squares too.
+/// [§3.5] How the outline of S_M is healed: by cases 1 and 2, or [departure] by rim regularization
+/// with whole squares, or with half squares too.
 enum class Outline { paper, squares, halfSquares };
 
 struct InsertOptions {
-  double lc = 0;              // [eq. (1)] l_c, length unit of the input; > 0 and below dist(∂M, S)
+  double lc = 0;  // [eq. (1)] l_c, length unit of the input; > 0 and below dist(∂M, S)
   Outline outline = Outline::halfSquares;  // [§3.5 departure]
-  bool followRim = true;      // [§3.6 departure] rim correspondence and anchored equations
-  int maxTets = 20000000;     // refuse where more tetrahedra are predicted
-  OptimizeOptions optimize;   // §3.7; its active and globalDescent are set by the insertion
-  // Called after each stage with the mesh as it is then: "approximated" (3.2), "healed" (3.3), for each way that is
-  // tried "extracted" (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the end "smoothed" (3.7).
+  bool followRim = true;     // [§3.6 departure] rim correspondence and anchored equations
+  int maxTets = 20000000;    // refuse where more tetrahedra are predicted
+  OptimizeOptions optimize;  // §3.7; its active and globalDescent are set by the insertion
+  // Called after each stage with the mesh as it is then: "approximated" (3.2), "healed" (3.3), for
+  // each way that is tried "extracted" (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the
+  // end "smoothed" (3.7).
   std::function<void(const char* stage, const Mesh&)> onStage = nullptr;
   std::function<void(const std::string& line)> onProgress = nullptr;  // a line per step
   // A callback may throw to stop, but no MethodError or SolverError: M is then unchanged.
@@ -202,31 +239,35 @@ struct InsertOptions {
 };
 
 struct InsertReport {
-  int surface = 0;             // its number k: M.surfaces[k-1], faces labelled k
-  double lc = 0;               // as used
-  int way = 0;                 // which of the tried ways (sides, outlines) was taken, from 1
-  int nodes = 0, triangles = 0;// of S_M
-  double maxNodeDistance = 0;  // largest |x_i - S| of the nodes of S_M
-  double hausdorff = 0;        // two-sided, S_M - S, sampled
-  double tangentialShift = 0;  // largest distance of a projected node from the point of S nearest to it before
-  QualityStatistics original, refined, projected, smoothed;  // against the computational elements; refined: after 3.5
-  QualityStatistics regular;                                 // smoothed, against the regular tetrahedron
+  int surface = 0;               // its number k: M.surfaces[k-1], faces labelled k
+  double lc = 0;                 // as used
+  int way = 0;                   // which of the tried ways (sides, outlines) was taken, from 1
+  int nodes = 0, triangles = 0;  // of S_M
+  double maxNodeDistance = 0;    // largest |x_i - S| of the nodes of S_M
+  double hausdorff = 0;          // two-sided, S_M - S, sampled
+  // largest distance of a projected node from the point of S nearest to it before
+  double tangentialShift = 0;
+  // against the computational elements; refined: after 3.5
+  QualityStatistics original, refined, projected, smoothed;
+  QualityStatistics regular;  // smoothed, against the regular tetrahedron
   OptimizeReport optimization;
   std::vector<std::string> warnings;  // valid but poor: what and where
 };
 
 // ==== 2. Meccano: boxes and Kossaczký bisection [17] ============================================
 
-/// [§2, §3.1] A box of near-cubic cells, each cell six Kuhn tetrahedra of type 0; its meccano is the
-/// lattice of unit cubes. Six patches (x-, x+, y-, y+, z-, z+ are 1 .. 6), twelve curves, eight corners.
+/// [§2, §3.1] A box of near-cubic cells, each cell six Kuhn tetrahedra of type 0; its meccano is
+/// the lattice of unit cubes. Six patches (x-, x+, y-, y+, z-, z+ are 1 .. 6), twelve curves, eight
+/// corners.
 ///   origin, size  length unit of the input, size > 0
 ///   cells         >= 1 each
 ///   errors        InputError
 Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells);
 
-/// [§3.2, after 17] Bisects each tetrahedron of E once, after its neighbours where conformity asks for it.
-/// Child 0 keeps the parent's index, child 1 is appended; new nodes are midpoints, on surfaces and curves
-/// the parametric ones [choice]. Lists of tetrahedra stay valid, but name half of what they named.
+/// [§3.2, after 17] Bisects each tetrahedron of E once, after its neighbours where conformity asks
+/// for it. Child 0 keeps the parent's index, child 1 is appended; new nodes are midpoints, on
+/// surfaces and curves the parametric ones [choice]. Lists of tetrahedra stay valid, but name half
+/// of what they named.
 ///   errors  MethodError where the mesh is not a bisection of Kuhn cubes
 void bisect(Mesh& M, const std::vector<int>& E);
 
@@ -238,7 +279,8 @@ struct Bisection {
   std::vector<std::pair<int, int>> splits;    // log: index of the parent (now child 0), of child 1
 
   explicit Bisection(Mesh& M);
-  /// Kossaczký's method: first neighbours with another refinement edge, then the whole ring at once.
+  /// Kossaczký's method: first neighbours with another refinement edge, then the whole ring at
+  /// once.
   void bisect(int E, int depth = 0);
   /// Bisects tetrahedra at the edge (a, b) until it is split; nothing where there is no such edge.
   void bisectEdge(int a, int b);
@@ -248,7 +290,9 @@ struct Bisection {
   int tetWithEdge(int a, int b) const;
 
   /// Dimension and number (as in Mesh::entity) of what the edge (a, b) lies on.
-  struct EdgeEntity { int dimension, entity; };
+  struct EdgeEntity {
+    int dimension, entity;
+  };
   EdgeEntity entityOf(int a, int b, const std::vector<int>& around) const;
 
  private:
@@ -263,19 +307,24 @@ std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M);
 Vec3 gamma(const Curve& C, double s);
 
 /// Where u lies in ϕ's triangulation of 𝓤.
-struct Location { int triangle; double w[3]; };  // triangle -1: outside; w >= 0, sum 1
+struct Location {
+  int triangle;
+  double w[3];
+};  // triangle -1: outside; w >= 0, sum 1
 void buildLocator(Parametrization& P);
 Location locate(const Parametrization& P, Vec2 u);
 /// [§3.6, eq. (3)] ϕ(u): affine on each triangle of 𝓤; errors: MethodError where u is outside.
 Vec3 varphi(const Parametrization& P, Vec2 u);
 Vec3 varphi(const Parametrization& P, const Location& at);
 
-/// u of node n on the surface with this label: its own, or that of its curve or corner there. False: not on it.
+/// u of node n on the surface with this label: its own, or that of its curve or corner there.
+/// False: not on it.
 bool parameterOn(const Mesh& M, int n, int label, Vec2& u);
 
 /// The surface or patch with a label as in Mesh::faceLabel.
 const Parametrization& surfaceOf(const Mesh& M, int label);
-/// Faces labelled k (S_M of inserted surface k, or boundary patch -k), each once. [faces], node indices
+/// Faces labelled k (S_M of inserted surface k, or boundary patch -k), each once. [faces], node
+/// indices
 std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
 
 // ==== 3.1 Problem statement =====================================================================
@@ -305,10 +354,10 @@ enum class Feature { face, edge, vertex };
 struct ClosestPoint {
   double distance;
   Vec3 point;
-  int triangle;     // -1: there is none
-  double w[3];      // barycentric coordinates of point, >= 0, sum 1
+  int triangle;  // -1: there is none
+  double w[3];   // barycentric coordinates of point, >= 0, sum 1
   Feature feature;
-  int which;        // edge from vertex `which` to the next, or vertex; 0 for a face
+  int which;  // edge from vertex `which` to the next, or vertex; 0 for a face
 };
 /// Nearest point of the triangle abc. Exact to rounding for needles too: the foot inside the
 /// triangle competes with the nearest points of the edges. A segment is a triangle with c = b.
@@ -316,9 +365,14 @@ ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c);
 
 /// Bounding boxes in a binary tree over triangles. Owns copies; building it is O(N log N).
 struct TriangleTree {
-  struct Box { Vec3 lo, hi; };
+  struct Box {
+    Vec3 lo, hi;
+  };
   /// A leaf holds triangles first .. first + count; else count = 0, its children self + 1, right.
-  struct Node { Box box; int first, count, right; };
+  struct Node {
+    Box box;
+    int first, count, right;
+  };
   std::vector<Node> nodes;                   // depth first
   std::vector<int> triangle;                 // [triangles], input number, in tree order
   std::vector<std::array<Vec3, 3>> corners;  // [triangles], in tree order
@@ -330,7 +384,8 @@ struct TriangleTree {
   /// Looks no farther than `within`: the triangle is -1 where nothing is as near.
   ClosestPoint closest(Vec3 x, double within = 1e300) const;
   /// Calls found(t) for each triangle whose box meets the closed box [lo, hi], until that is true.
-  template <class Found> void visit(Vec3 lo, Vec3 hi, Found found) const;
+  template <class Found>
+  void visit(Vec3 lo, Vec3 hi, Found found) const;
 };
 
 inline bool boxesMeet(const TriangleTree::Box& a, Vec3 lo, Vec3 hi) {
@@ -340,7 +395,8 @@ inline bool boxesMeet(const TriangleTree::Box& a, Vec3 lo, Vec3 hi) {
 
 TriangleTree::Box boxOf(const std::array<Vec3, 3>& corners);
 
-template <class Found> void TriangleTree::visit(Vec3 lo, Vec3 hi, Found found) const {
+template <class Found>
+void TriangleTree::visit(Vec3 lo, Vec3 hi, Found found) const {
   std::vector<int> stack;
   if (!nodes.empty()) stack.push_back(0);
   while (!stack.empty()) {
@@ -360,28 +416,28 @@ template <class Found> void TriangleTree::visit(Vec3 lo, Vec3 hi, Found found) c
 
 /// What S says about a point x of space: its nearest point, and which side of S that is.
 struct SurfaceQuery : ClosestPoint {
-  Vec3 normal;       // unit angle-weighted pseudo-normal of the nearest face, edge or vertex
-  double side;       // (x - point) · normal: its sign is the side of S [§3.4]; beyond the rim this
-                     // extends S tangentially
-  bool onRim;        // the nearest feature is an edge or vertex of the rim
-  double excess;     // tangential distance beyond the rim, 0 where not onRim
+  Vec3 normal;    // unit angle-weighted pseudo-normal of the nearest face, edge or vertex
+  double side;    // (x - point) · normal: its sign is the side of S [§3.4]; beyond the rim this
+                  // extends S tangentially
+  bool onRim;     // the nearest feature is an edge or vertex of the rim
+  double excess;  // tangential distance beyond the rim, 0 where not onRim
 };
 
 /// [§3.4] A surface that has passed checkSurface(), ready for distances and sides.
 struct SurfaceDistance {
   TriangleSurface S;
   TriangleTree tree;
-  std::vector<int> rim;                    // the rim's points, S on its left
-  TriangleTree rimTree;                    // triangle i is the segment from rim[i] to the next
-  std::vector<Vec3> faceNormal;            // [triangles]
-  std::vector<std::array<Vec3, 3>> edgeNormal;     // [triangles]
-  std::vector<Vec3> vertexNormal;          // [points]
-  std::vector<std::array<int, 3>> neighbours;      // [triangles]
-  std::vector<char> isRimPoint;            // [points]
+  std::vector<int> rim;                         // the rim's points, S on its left
+  TriangleTree rimTree;                         // triangle i is the segment from rim[i] to the next
+  std::vector<Vec3> faceNormal;                 // [triangles]
+  std::vector<std::array<Vec3, 3>> edgeNormal;  // [triangles]
+  std::vector<Vec3> vertexNormal;               // [points]
+  std::vector<std::array<int, 3>> neighbours;   // [triangles]
+  std::vector<char> isRimPoint;                 // [points]
 
   explicit SurfaceDistance(const TriangleSurface& cleaned);
   SurfaceQuery query(Vec3 x) const;
-  double rimDistance(Vec3 x) const;        // distance to the rim polyline
+  double rimDistance(Vec3 x) const;  // distance to the rim polyline
 };
 
 /// Smallest distance of two triangle sets (dist(∂M, S) of eq. (1)) and where; 0 where they cross.
@@ -401,8 +457,8 @@ double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int sampl
 /// Whether the closed triangle meets the closed tetrahedron (relative tolerance 1e-9).
 bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle);
 
-/// [§3.2] r^E: the longest edge of tetrahedron E, length unit of the input. [choice] measured on the
-/// undeformed cubes: on a smoothed mesh one stretched element would ask for a level too many.
+/// [§3.2] r^E: the longest edge of tetrahedron E, length unit of the input. [choice] measured on
+/// the undeformed cubes: on a smoothed mesh one stretched element would ask for a level too many.
 double longestEdge(const Mesh& M, int E);
 /// [§3.2, §3.3] The level of whole cubes at which no element has r^E >= l_c: a multiple of 3.
 int cubeLevel(const Mesh& M, double lc);
@@ -419,18 +475,21 @@ Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, do
 
 // ==== 3.3 Volumetric approximation healing ======================================================
 
-/// [§3.3, eq. (2)] χ = n_E − n_F + n_C of the edges, faces and cells of 𝓣 adjacent to a node: 1 for a local disk.
+/// [§3.3, eq. (2)] χ = n_E − n_F + n_C of the edges, faces and cells of 𝓣 adjacent to a node: 1 for
+/// a local disk.
 int chi(int nE, int nF, int nC);
-/// Eq. (2) at a lattice node with the cubes of 𝓣 around it: bit x + 2 y + 4 z for the cube on the sides x, y, z.
+/// Eq. (2) at a lattice node with the cubes of 𝓣 around it: bit x + 2 y + 4 z for the cube on the
+/// sides x, y, z.
 int chi(unsigned cubes);
 /// Whether these of the eight cubes are connected through faces.
 bool isFaceConnected(unsigned cubes);
-/// [§3.3, eq. (2)] [departure] Eq. (2) and the 2×2×2 rule: cubes inside and outside each face-connected. Two
-/// cubes that share an edge only have χ = 1 at both of its ends and are no manifold; so has a disk with an annulus.
+/// [§3.3, eq. (2)] [departure] Eq. (2) and the 2×2×2 rule: cubes inside and outside each
+/// face-connected. Two cubes that share an edge only have χ = 1 at both of its ends and are no
+/// manifold; so has a disk with an annulus.
 bool isLocalDisk(unsigned cubes);
 
-/// [§3.3] Adds elements until ∂𝓣 is a surface: whole cubes (faces parallel to the coordinate planes), and
-/// all elements at nodes that are no local disk.
+/// [§3.3] Adds elements until ∂𝓣 is a surface: whole cubes (faces parallel to the coordinate
+/// planes), and all elements at nodes that are no local disk.
 ///   errors  MethodError: 𝓣 grows into the boundary, or does not settle
 void volumetricHealing(Bisection& B, Approximation& A);
 
@@ -442,12 +501,12 @@ struct Square {
   std::array<int, 4> across;      // square across the edge from corner e to corner e + 1
   std::array<int, 4> acrossEdge;  // that edge's number there
   Vec3 centre;                    // physical
-  int diagonal = 0;               // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
+  int diagonal = 0;  // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
 };
 /// ∂𝓣 as squares, a topological sphere.
 struct SquareSurface {
-  int level = 0;                            // of 𝓣
-  double h = 0;                             // physical edge of a cube
+  int level = 0;  // of 𝓣
+  double h = 0;   // physical edge of a cube
   std::vector<Square> squares;
   std::vector<std::uint64_t> keys;          // [squares], place in the computational lattice
   std::vector<int> nodes;                   // mesh nodes on ∂𝓣
@@ -457,30 +516,32 @@ struct SquareSurface {
 /// [§3.3, §3.4] errors: MethodError where ∂𝓣 is no sphere.
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
 
-/// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1 and the
-/// centre. 0 nothing, 15 the square; 3, 6, 12, 9 the halves along a diagonal.
+/// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1
+/// and the centre. 0 nothing, 15 the square; 3, 6, 12, 9 the halves along a diagonal.
 using Selection = std::vector<unsigned char>;
 
 /// S_M as squares, before and after 3.5's work on its outline.
 struct Extraction {
   Selection selected;
-  double energy = 0;   // what sides are ranked by: rim energy and interior coverage
-  std::string fault;   // why it is no disk; empty: it is one
+  double energy = 0;  // what sides are ranked by: rim energy and interior coverage
+  std::string fault;  // why it is no disk; empty: it is one
 };
-/// [§3.4] The squares with all nodes on this side (±1) of S, one disk; then the outline's healing: cases 1
-/// and 2 of §3.5, or [departure] rim regularization, with half squares where asked for.
-Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
-                             Outline outline);
+/// [§3.4] The squares with all nodes on this side (±1) of S, one disk; then the outline's healing:
+/// cases 1 and 2 of §3.5, or [departure] rim regularization, with half squares where asked for.
+Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                             int side, Outline outline);
 /// Labels the faces of the selection with surface number k; bisects diagonals where halves need it.
-void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A, const Selection& selected,
-                  int k);
+void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
+                  const Selection& selected, int k);
 
 // ==== 3.5 Surface healing =======================================================================
 // Each returns whether it changed anything; done again it changes nothing.
 
-/// [§3.5.1] Removes thin protrusions: squares (pairs of triangles) with three edges on the rim, recursively.
+/// [§3.5.1] Removes thin protrusions: squares (pairs of triangles) with three edges on the rim,
+/// recursively.
 bool removeThinProtrusions(const SquareSurface& Q, Selection& selected);
-/// [§3.5.2] Adds the square in the plane of the two rim edges at rim nodes with five or more triangles.
+/// [§3.5.2] Adds the square in the plane of the two rim edges at rim nodes with five or more
+/// triangles.
 bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected);
 /// [§3.5.3] Refines tetrahedra with more than one face on S_M.
 bool refineTetrahedraWithTwoFaces(Bisection& B, int k);
@@ -490,9 +551,9 @@ bool refineFacesWithTwoRimEdges(Bisection& B, int k);
 bool refineEdgesAcrossTheRim(Bisection& B, int k);
 /// [§3.5.6] Refines edges that join S_M to another surface or to the boundary.
 bool refineEdgesBetweenSurfaces(Bisection& B, int k);
-/// [§3.5] [departure] S_M must be a full subcomplex: bisects each edge with both ends on S_M that is no edge
-/// of it, and splits each face with three nodes on S_M that is no face of it. Where S is flat such a chord
-/// has zero length to give: the six cases alone left no random surface valid.
+/// [§3.5] [departure] S_M must be a full subcomplex: bisects each edge with both ends on S_M that
+/// is no edge of it, and splits each face with three nodes on S_M that is no face of it. Where S is
+/// flat such a chord has zero length to give: the six cases alone left no random surface valid.
 bool refineToFullSubcomplex(Bisection& B, int k);
 /// [§3.5] Cases 3 to 6 and the full subcomplex until nothing changes.
 ///   returns rounds;  errors  MethodError after 30
@@ -502,9 +563,9 @@ int surfaceHealing(Bisection& B, int k);
 
 /// A square matrix in compressed rows; columns ascend within a row.
 struct SparseMatrix {
-  std::vector<int> start;      // [rows + 1]
-  std::vector<int> column;     // [entries]
-  std::vector<double> value;   // [entries]
+  std::vector<int> start;     // [rows + 1]
+  std::vector<int> column;    // [entries]
+  std::vector<double> value;  // [entries]
 };
 
 /// Solves A x = b by BiCGSTAB with the SSOR preconditioner.
@@ -568,8 +629,8 @@ struct SurfaceParametrization {
 SurfaceParametrization parametrizeSurface(const SurfaceDistance& S);
 
 struct ProjectionReport {
-  double tangentialShift = 0;     // largest distance of x' from the point of S nearest to x
-  std::vector<int> cornerNodes;   // nodes fixed at sharp corners
+  double tangentialShift = 0;    // largest distance of x' from the point of S nearest to x
+  std::vector<int> cornerNodes;  // nodes fixed at sharp corners
 };
 
 /// [§3.6, eq. (3), (4)] Moves the nodes of S_M (faces labelled k = M.surfaces.size() + 1, a disk)
@@ -584,7 +645,8 @@ struct ProjectionReport {
 ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& S, bool followRim);
 
 // ==== 3.7 Mesh optimization (optimize.cpp) ======================================================
-// J = Jφ: ideal (computational) element → physical element, both with the vertices in the same order.
+// J = Jφ: ideal (computational) element → physical element, both with the vertices in the same
+// order.
 
 /// [§3.7.1, eq. (5)] η = ‖J‖² / (3 |σ|^⅔): 1 for similarities, ∞ (σ = 0) for a degenerate element.
 double eta(const Mat3& J);
@@ -599,17 +661,22 @@ double quality(const Mat3& J);
 double h(double sigma, double delta);
 /// η with h(σ) for |σ|; finite for δ > 0, ∞ for δ = 0 and σ <= 0.
 double etaRegularized(const Mat3& J, double delta);
-/// [§3.7.1, δ after 23, 30] δ with h(σ_min) = mu: δ² = mu (mu − σ_min); 0 where σ_min > 0 and no regularization is needed.
+/// [§3.7.1, δ after 23, 30] δ with h(σ_min) = mu: δ² = mu (mu − σ_min); 0 where σ_min > 0 and no
+/// regularization is needed.
 double chooseDelta(double sigmaMin, double mu);
 
 /// Refuses options out of range for a mesh of so many nodes: InputError.
 void checkOptions(const OptimizeOptions& options, std::size_t nodes);
 
 /// An objective with its derivatives at one point.
-struct Objective { double f; Vec3 gradient; Mat3 hessian; };
+struct Objective {
+  double f;
+  Vec3 gradient;
+  Mat3 hessian;
+};
 
-/// The star of a node: what eq. (9) needs of the elements adjacent to it, in closed form. With g the
-/// gradient, in the ideal element, of the node's barycentric function, and d its displacement:
+/// The star of a node: what eq. (9) needs of the elements adjacent to it, in closed form. With g
+/// the gradient, in the ideal element, of the node's barycentric function, and d its displacement:
 /// J = J₀ + d gᵀ, so that ‖J‖² = N + 2 v·d + |g|²|d|² and det J = σ + s·d, exactly.
 struct StarElement {
   double N, sigma, gg;  // ‖J₀‖², det J₀, |g|²
@@ -630,34 +697,43 @@ double fVarphi(const Star& star, const Parametrization& P, Vec2 u, double delta,
 /// [§3.7.3, eq. (11)] f_γ(s) = f ∘ γ(s).
 double fGamma(const Star& star, const Curve& C, double s, double delta, double power = 1);
 
-/// [§3.7.4, strong Wolfe conditions, 33] A step length t with F(t) <= F(0) + c1 t F'(0) and |F'(t)| <= c2 |F'(0)|.
-struct LinePoint { double F, slope; };
-struct WolfeStep { double t; bool armijo, curvature; int evaluations; };  // t = 0 where no step was found
+/// [§3.7.4, strong Wolfe conditions, 33] A step length t with F(t) <= F(0) + c1 t F'(0) and |F'(t)|
+/// <= c2 |F'(0)|.
+struct LinePoint {
+  double F, slope;
+};
+struct WolfeStep {
+  double t;
+  bool armijo, curvature;
+  int evaluations;
+};  // t = 0 where no step was found
 /// Bracketing and zoom with safeguarded cubic steps, at most 20; F may be ∞.
 WolfeStep strongWolfe(const std::function<LinePoint(double t)>& F, double tFirst, double tMax);
 
-/// [§3.7.4, Algorithm 2] Untangles and smooths M node by node; boundary, surface and curve nodes slide on
-/// their entities, corners stay. Works on any tetrahedral mesh: without M.xi the ideal elements are regular,
-/// without M.dimension the boundary is fixed. Indices and entities keep; M.x and M.parameter change.
+/// [§3.7.4, Algorithm 2] Untangles and smooths M node by node; boundary, surface and curve nodes
+/// slide on their entities, corners stay. Works on any tetrahedral mesh: without M.xi the ideal
+/// elements are regular, without M.dimension the boundary is fixed. Indices and entities keep; M.x
+/// and M.parameter change.
 ///   errors  InputError: options out of range, a malformed mesh.
 ///           No exception for an unfinished optimization: see the report.
 OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options = {});
 
-/// [§4, Table I] Statistics of q against the computational elements, or against the regular tetrahedron
-/// (where M has no computational coordinates, always).
+/// [§4, Table I] Statistics of q against the computational elements, or against the regular
+/// tetrahedron (where M has no computational coordinates, always).
 enum class Ideal { computational, regular };
 QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal = Ideal::computational);
 /// q of each tetrahedron. [tets]
 std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational);
 
-
 // ==== 3. Surface insertion ======================================================================
 
 /// [§3] Inserts S into M: 3.2 approximation, 3.3 healing, 3.4 extraction, 3.5 surface healing,
-/// 3.6 projection, 3.7 optimization. Afterwards 0 elements are inverted and every node of S_M lies on S.
-///   errors  InputError: S, M or the options break §3.1 (see checkSurface), l_c is not below dist(∂M, S) or the
-///           distance to an earlier surface, too many tetrahedra; MethodError: a step cannot reach what it promises;
-///           SolverError: a linear solve failed. M is unchanged when it throws.
+/// 3.6 projection, 3.7 optimization. Afterwards 0 elements are inverted and every node of S_M lies
+/// on S.
+///   errors  InputError: S, M or the options break §3.1 (see checkSurface), l_c is not below
+///   dist(∂M, S) or the
+///           distance to an earlier surface, too many tetrahedra; MethodError: a step cannot reach
+///           what it promises; SolverError: a linear solve failed. M is unchanged when it throws.
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options);
 
 }  // namespace meccano

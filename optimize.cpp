@@ -443,8 +443,10 @@ struct Smoother {
   std::vector<double> unrest =
       {};  // [nodes] largest move in its star since its last visit, relative
 
-  struct SheetTriangle { int a, b, label; };  // with its node counter-clockwise in 𝓤 of the surface
-  std::vector<int> sheetStart = {};           // [nodes + 1] surface triangles at n, rows of sheet
+  struct SheetTriangle {
+    int a, b, label;
+  };                                 // with its node counter-clockwise in 𝓤 of the surface
+  std::vector<int> sheetStart = {};  // [nodes + 1] surface triangles at n, rows of sheet
   std::vector<SheetTriangle> sheet = {};
 
   double delta = 0;  // of the sweep, relative to the mean σ
@@ -603,9 +605,9 @@ double visitInner(Smoother& S, int n, const Edges& edges) {
   return step.t * norm(d.p);
 }
 
-/// [departure] Whether the surface triangles at n stay counter-clockwise in 𝓤 with n at this parameter.
-/// While elements are inverted f alone lets a node slide past its neighbours, or a rim node round a
-/// corner, from where no descent brings it back.
+/// [departure] Whether the surface triangles at n stay counter-clockwise in 𝓤 with n at this
+/// parameter. While elements are inverted f alone lets a node slide past its neighbours, or a rim
+/// node round a corner, from where no descent brings it back.
 bool staysUnfolded(Smoother& S, int n, Vec2 parameter) {
   if (S.sheetStart.empty()) return true;
   const Vec2 before = S.M.parameter[n];
