@@ -3297,6 +3297,12 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
       ++report.nodes;
       report.maxNodeDistance = std::max(report.maxNodeDistance, S.query(M.x[n]).distance);
     }
+  // [choice] on S: 1e-12 of its diagonal, and the last digits of coordinates far from the origin
+  const TriangleTree::Box& box = S.tree.nodes[0].box;
+  const double allowed = 1e-12 * norm(box.hi - box.lo) + 1e-15 * (norm(box.hi) + norm(box.lo));
+  if (report.maxNodeDistance > allowed)
+    throw MethodError("insertSurface (§3.6): a node of S_M is " + number(report.maxNodeDistance) +
+                      " away from S");
   report.triangles = static_cast<int>(faces.size());
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
   if (report.hausdorff > badHausdorff * report.lc)
