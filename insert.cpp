@@ -1635,12 +1635,18 @@ void joinSquares(SquareSurface& Q) {
     }
 }
 
+/// Place in the lattice → 1 + number of the square.
+KeyMap squareNumbers(const SquareSurface& Q) {
+  KeyMap numbers(Q.keys.size());
+  for (std::size_t i = 0; i < Q.keys.size(); ++i) numbers[Q.keys[i]] = static_cast<int>(i) + 1;
+  return numbers;
+}
+
 /// Which diagonal of each square is an edge of the mesh: the longest edge of its faces. (Bisection
 /// reflects the cubes: it is not Kuhn's lowest to highest corner.)
 void findDiagonals(const Mesh& M, const Approximation& A, SquareSurface& Q) {
   const Lattice lattice(A.level);
-  KeyMap squareAt(Q.keys.size());
-  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
+  const KeyMap squareAt = squareNumbers(Q);
   std::array<std::int64_t, 3> half;
   for (int E : elementsOf(A.T))
     for (int i = 0; i < 4; ++i) {
@@ -2154,8 +2160,7 @@ void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
                   const Selection& selected, int k) {
   Mesh& M = B.M;
   const Lattice lattice(Q.level);
-  KeyMap squareAt(Q.keys.size());
-  for (std::size_t i = 0; i < Q.keys.size(); ++i) squareAt[Q.keys[i]] = static_cast<int>(i) + 1;
+  const KeyMap squareAt = squareNumbers(Q);
   std::array<std::int64_t, 3> half;
   for (int E : elementsOf(A.T))
     for (int i = 0; i < 4; ++i) {
