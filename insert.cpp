@@ -3346,7 +3346,10 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
 /// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
 /// report.
 void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, InsertReport& report) {
-  constexpr double goodQuality = .6;  // [choice] min q below which the other ways are tried too
+  // [choice] min q below which the other ways are tried too: above 50k tetrahedra they cost too
+  // much
+  constexpr double goodQuality = .6, goodLargeQuality = .45;
+  constexpr std::size_t large = 50000;
   I.M = M;
   Bisection B(I.M);
   I.A = volumetricApproximation(B, I.S, lc);
@@ -3356,9 +3359,10 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   I.stage("healed", I.M);
   I.progress("3.2-3.3 approximation: " + std::to_string(I.M.tets.size()) + " tetrahedra, " +
              std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
+  const double good = I.M.tets.size() < large ? goodQuality : goodLargeQuality;
   auto isGood = [&] {
     return report.surface > 0 &&
-           (report.smoothed.min >= goodQuality || I.options.outline == Outline::paper);
+           (report.smoothed.min >= good || I.options.outline == Outline::paper);
   };
   std::vector<Outline> outlines{I.options.outline};
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
