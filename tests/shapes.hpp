@@ -440,5 +440,11 @@ inline double computationalArea(const Mesh& M, int k) {
   return area;
 }
 
+/// The quadrilateral a b c d as two triangles, cut from a to c or from b to d.
+inline void addCell(TriangleSurface& S, bool fromA, int a, int b, int c, int d) {
+  S.triangles.push_back(fromA ? std::array<int, 3>{a, b, c} : std::array<int, 3>{a, b, d});
+  S.triangles.push_back(fromA ? std::array<int, 3>{a, c, d} : std::array<int, 3>{b, c, d});
+}
+
 }  // namespace shapes
 #endif

@@ -21,7 +21,7 @@ constexpr const char* help =
     ".12, 101 .. 200 at .06\n"
     "       stress --figures [--paper | --default]             the named cases, with their floors\n"
     "  --only TEXT     cases whose name contains TEXT\n"
-    "  --power P       exponent of the sweeps on the worst elements\n"
+    "  --power P       exponent of the term that lifts the worst elements\n"
     "  --whole         whole squares at the rim\n"
     "  --threads N     cases run side by side (1)\n"
     "  --write PREFIX  writes the surface of each case to PREFIX<name>.obj, and runs nothing\n"

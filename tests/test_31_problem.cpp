@@ -9,6 +9,8 @@
 #include <string>
 #include <vector>
 
+#include "shapes.hpp"
+
 using namespace meccano;
 
 namespace {
@@ -43,13 +45,7 @@ TriangleSurface bentGrid(int n, int m) {
   for (int j = 0; j < m; ++j)
     for (int i = 0; i < n; ++i) {
       int a = j * (n + 1) + i, b = a + 1, c = b + n + 1, d = a + n + 1;
-      if ((i + j) % 2 == 0) {
-        S.triangles.push_back({a, b, c});
-        S.triangles.push_back({a, c, d});
-      } else {
-        S.triangles.push_back({a, b, d});
-        S.triangles.push_back({b, c, d});
-      }
+      shapes::addCell(S, (i + j) % 2 == 0, a, b, c, d);
     }
   return S;
 }

@@ -10,6 +10,8 @@
 #include <utility>
 #include <vector>
 
+#include "shapes.hpp"
+
 using namespace meccano;
 
 namespace {
@@ -36,13 +38,7 @@ TriangleSurface cells(int n, int m, double w, double h, Keep keep, Height height
     for (int i = 0; i < n; ++i) {
       if (!keep(i, j)) continue;
       int a = point(i, j), b = point(i + 1, j), c = point(i + 1, j + 1), d = point(i, j + 1);
-      if ((i + j) % 2 == 0) {
-        S.triangles.push_back({a, b, c});
-        S.triangles.push_back({a, c, d});
-      } else {
-        S.triangles.push_back({a, b, d});
-        S.triangles.push_back({b, c, d});
-      }
+      shapes::addCell(S, (i + j) % 2 == 0, a, b, c, d);
     }
   return S;
 }
