@@ -3114,16 +3114,6 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   if (!(lc < gap.distance))
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below dist(∂M, S) = " +
                      number(gap.distance) + at(gap) + "; lower l_c");
-  for (const Parametrization& earlier : M.surfaces) {
-    const Gap between = smallestGap(S.tree, earlier.points, earlier.triangles);
-    if (between.distance <= 0)
-      throw InputError("insertSurface (§3.1): S touches the inserted surface '" + earlier.name +
-                       "'" + at(between) + "; surfaces must not meet");
-    if (!(lc < between.distance))
-      throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below the distance " +
-                       number(between.distance) + " to the inserted surface '" + earlier.name +
-                       "'" + at(between) + "; lower l_c");
-  }
 }
 
 /// l_c against the size of what comes: not more tetrahedra than allowed, not smaller than S.
@@ -3379,20 +3369,27 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
 
 }  // namespace
 
-InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
-  constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
-  checkMeccano(M, "insertSurface (§3.1)");
-  checkOptions(options, M.x.size());
-  InsertReport report;
-  report.original = qualityStatistics(M);
-  if (report.original.inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " +
-                     std::to_string(report.original.inverted) +
-                     " inverted elements; untangle it first (optimizeMesh)");
+namespace {
+
+/// A surface of the call that has passed §3.1.
+struct Candidate {
+  SurfaceDistance S;
+  std::vector<std::string> warnings;
+};
+
+Candidate candidate(const TriangleSurface& S) {
   std::vector<std::string> warnings;
   TriangleSurface disk = checkSurface(S, warnings);
   splitChords(disk);
-  const SurfaceDistance cleaned(disk);
+  return {SurfaceDistance(disk), std::move(warnings)};
+}
+
+/// 3.2 to 3.7 for one surface, with half of l_c where no way is valid.
+InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
+  constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
+  const SurfaceDistance& cleaned = candidate.S;
+  InsertReport report;
+  report.original = qualityStatistics(M);
   checkDistances(M, cleaned, options.lc);
   checkSize(M, cleaned, options.lc, options.maxTets);
 
@@ -3409,6 +3406,7 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
     throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
                       " nor at half of it, after " + std::to_string(I.faults) +
                       " tries, the last because " + I.reason + "; lower l_c");
+  std::vector<std::string> warnings = candidate.warnings;
   if (report.lc < options.lc)
     warnings.push_back("l_c was halved to " + number(report.lc) + ", because at " +
                        number(options.lc) + " no way was valid");
@@ -3417,6 +3415,35 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
   I.stage("smoothed", result);
   M = std::move(result);
   return report;
+}
+
+/// What an insertion asks of the mesh and the options before it looks at a surface.
+void checkStart(const Mesh& M, const InsertOptions& options) {
+  checkMeccano(M, "insertSurface (§3.1)");
+  checkOptions(options, M.x.size());
+  const int inverted = qualityStatistics(M).inverted;
+  if (inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(inverted) +
+                     " inverted elements; untangle it first (optimizeMesh)");
+}
+
+}  // namespace
+
+InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
+  checkStart(M, options);
+  return insertCandidate(M, candidate(S), options);
+}
+
+std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
+                                         const InsertOptions& options) {
+  checkStart(M, options);
+  std::vector<Candidate> all;
+  for (const TriangleSurface& one : S) all.push_back(candidate(one));
+  Mesh result = M;
+  std::vector<InsertReport> reports;
+  for (const Candidate& one : all) reports.push_back(insertCandidate(result, one, options));
+  M = std::move(result);
+  return reports;
 }
 
 }  // namespace meccano

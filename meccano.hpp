@@ -736,5 +736,9 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational)
 ///           what it promises; SolverError: a linear solve failed. M is unchanged when it throws.
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options);
 
+/// [§3] Inserts several surfaces, in this order, all or none.
+std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
+                                         const InsertOptions& options);
+
 }  // namespace meccano
 #endif
