@@ -69,6 +69,13 @@ std::vector<Row> rows() {
   Row crossing{"cfm_neg_crossing_pair", {"cfm_neg_crossing_pair"}, 1200};
   crossing.refused = {"East_Shoreline", "Southern_San_Andreas", "near ("};
   all.push_back(crossing);
+  for (double lc : {1200., 600., 300.}) {
+    Row coyote{"coyote " + std::to_string(static_cast<int>(lc)),
+               {"cfm_puente_hills/WTRA-PHTS-COYT-Puente_Hills_Thrust_fault-CFM2.obj"},
+               lc};
+    coyote.slow = true;
+    all.push_back(coyote);
+  }
   Row fine{"cfm_mojave 500", {"cfm_mojave"}, 500};
   fine.figures = {.25, 0, 0, 0}, fine.slow = true;
   all.push_back(fine);
