@@ -962,6 +962,45 @@ std::vector<std::vector<int>> rimLoops(const TriangleSurface& S) {
   return loops;
 }
 
+std::vector<TriangleSurface> connectedComponents(const TriangleSurface& S,
+                                                 std::vector<std::string>& warnings) {
+  checkNumbers(S);
+  std::vector<std::string> repairs;
+  const TriangleSurface welded = weldAndDrop(S, repairs).S;
+  Parts parts(welded.points.size());
+  for (const std::array<int, 3>& t : welded.triangles) {
+    parts.join(t[0], t[1]);
+    parts.join(t[1], t[2]);
+  }
+  std::vector<TriangleSurface> components;
+  std::vector<int> componentOf(welded.points.size(), -1), numberOf(welded.points.size(), -1);
+  for (const std::array<int, 3>& t : welded.triangles) {
+    int& c = componentOf[parts.of(t[0])];
+    if (c < 0) {
+      c = static_cast<int>(components.size());
+      const std::string number = std::to_string(c + 1);
+      components.push_back({{}, {}, S.name.empty() ? number : S.name + '.' + number});
+    }
+    TriangleSurface& C = components[c];
+    std::array<int, 3> v = t;
+    for (int& n : v) {
+      int& number = numberOf[n];
+      if (number < 0) {
+        number = static_cast<int>(C.points.size());
+        C.points.push_back(welded.points[n]);
+      }
+      n = number;
+    }
+    C.triangles.push_back(v);
+  }
+  if (components.size() < 2) return {S};
+  warnings = repairs;
+  warnings.push_back("§3.1: '" + S.name + "' has " + std::to_string(components.size()) +
+                     " components; each becomes a surface: " + components.front().name + " to " +
+                     components.back().name);
+  return components;
+}
+
 TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings) {
   checkNumbers(S);
   CleanSurface C = weldAndDrop(S, warnings);
@@ -975,7 +1014,7 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
   if (sizes.size() > 1)
     refuseSurface("the surface has " + std::to_string(sizes.size()) +
                   " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
-                  std::to_string(sizes.back()) + " triangles); insert them one by one");
+                  std::to_string(sizes.back()) + " triangles); insert them one by one, or by insertSurfaces");
   const int turned = orientConsistently(C.S, neighbours);
   if (turned < 0) refuseSurface("the surface is not orientable (a Moebius band); cut it open");
   if (turned > 0)
@@ -3098,6 +3137,10 @@ void checkOptions(const InsertOptions& options, std::size_t nodes) {
   checkOptions(options.optimize, nodes);
 }
 
+/// [choice] Of a surface's diagonal: what is as near as this touches. Coordinates far from their
+/// origin (UTM) are good to 1e-10 of it.
+constexpr double touching = 1e-9;
+
 std::string at(const Gap& gap) {
   return " at triangle " + std::to_string(gap.triangle) + " near " + placeText(gap.point);
 }
@@ -3114,16 +3157,6 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   if (!(lc < gap.distance))
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below dist(∂M, S) = " +
                      number(gap.distance) + at(gap) + "; lower l_c");
-  for (const Parametrization& earlier : M.surfaces) {
-    const Gap between = smallestGap(S.tree, earlier.points, earlier.triangles);
-    if (between.distance <= 0)
-      throw InputError("insertSurface (§3.1): S touches the inserted surface '" + earlier.name +
-                       "'" + at(between) + "; surfaces must not meet");
-    if (!(lc < between.distance))
-      throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below the distance " +
-                       number(between.distance) + " to the inserted surface '" + earlier.name +
-                       "'" + at(between) + "; lower l_c");
-  }
 }
 
 /// l_c against the size of what comes: not more tetrahedra than allowed, not smaller than S.
@@ -3288,13 +3321,13 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
                       " elements stay inverted");
 }
 
-/// The measures of S_M that the report promises, and the warnings.
-void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertReport& report) {
+/// The measures of S_M that the report promises.
+///   errors  MethodError: a node of it is off S
+void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& report) {
   constexpr int samples = 4;
-  constexpr double poorHausdorff = .3, badHausdorff = .5;  // [choice] of l_c: warned of, refused
-  constexpr double poorShift = 2;                          // [choice] of h: warned of
   const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
   std::vector<char> on(M.x.size(), 0);
+  report.nodes = 0, report.maxNodeDistance = 0;
   for (const auto& face : faces)
     for (int n : face) {
       if (on[n]) continue;
@@ -3310,6 +3343,12 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
                       " away from S");
   report.triangles = static_cast<int>(faces.size());
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
+}
+
+/// Refuses S_M where it is far from S, and warns where it is poor.
+void judgeSurface(double h, InsertReport& report) {
+  constexpr double poorHausdorff = .3, badHausdorff = .5;  // [choice] of l_c: warned of, refused
+  constexpr double poorShift = 2;                          // [choice] of h: warned of
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
                       number(report.hausdorff) +
@@ -3331,7 +3370,8 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
   ofThisWay.surface = I.k, ofThisWay.lc = lc;
   try {
     insertOnWay(I, way, trial, ofThisWay);
-    measureSurface(trial, I.S, I.Q.h, ofThisWay);
+    measureSurface(trial, I.S, ofThisWay);
+    judgeSurface(I.Q.h, ofThisWay);
   } catch (const MethodError& error) {
     I.leave(describe(way), error);
     return;
@@ -3379,20 +3419,84 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
 
 }  // namespace
 
-InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
-  constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
-  checkMeccano(M, "insertSurface (§3.1)");
-  checkOptions(options, M.x.size());
-  InsertReport report;
-  report.original = qualityStatistics(M);
-  if (report.original.inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " +
-                     std::to_string(report.original.inverted) +
-                     " inverted elements; untangle it first (optimizeMesh)");
+namespace {
+
+/// A surface of the call that has passed §3.1.
+struct Candidate {
+  SurfaceDistance S;
+  std::string label;  // for messages
   std::vector<std::string> warnings;
+};
+
+Candidate candidateOf(const TriangleSurface& S, const std::string& label,
+                      std::vector<std::string> warnings = {}) {
   TriangleSurface disk = checkSurface(S, warnings);
   splitChords(disk);
-  const SurfaceDistance cleaned(disk);
+  return {SurfaceDistance(disk), label, std::move(warnings)};
+}
+
+/// Does what step() does; its errors begin with the label of the surface.
+template <class Step>
+auto labelled(const std::string& label, Step step) -> decltype(step()) {
+  const std::string prefix = label.empty() ? "" : label + ": ";
+  try {
+    return step();
+  } catch (const InputError& error) {
+    throw InputError(prefix + error.what());
+  } catch (const MethodError& error) {
+    throw MethodError(prefix + error.what());
+  } catch (const SolverError& error) {
+    throw SolverError(prefix + error.what());
+  }
+}
+
+std::string labelOf(const std::string& name, std::size_t number) {
+  return name.empty() ? "surface " + std::to_string(number) : "surface '" + name + "'";
+}
+
+/// The surfaces of a call, each component one; labels only where there are several.
+std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S) {
+  std::vector<Candidate> all;
+  for (std::size_t i = 0; i < S.size(); ++i) {
+    const std::string given = S.size() > 1 ? labelOf(S[i].name, i + 1) : "";
+    std::vector<std::string> warnings;
+    const std::vector<TriangleSurface> components =
+        labelled(given, [&] { return connectedComponents(S[i], warnings); });
+    for (const TriangleSurface& one : components) {
+      const std::string label = components.size() > 1 ? labelOf(one.name, i + 1) : given;
+      all.push_back(labelled(label, [&] { return candidateOf(one, label, warnings); }));
+      warnings.clear();
+    }
+  }
+  return all;
+}
+
+/// [§3.1] Refuses two surfaces of the call, or one and an earlier one, that cross or touch.
+void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
+  auto check = [](const Candidate& S, const std::string& other, const std::vector<Vec3>& points,
+                  const std::vector<std::array<int, 3>>& triangles) {
+    const Gap gap = smallestGap(S.S.tree, points, triangles);
+    const TriangleTree::Box& box = S.S.tree.nodes[0].box;
+    if (gap.distance <= touching * norm(box.hi - box.lo))
+      throw InputError("insertSurfaces (§3.1): " + (S.label.empty() ? "S" : S.label) + " and " +
+                       other + " cross or touch" + at(gap) +
+                       "; surfaces must not meet: cut one back, or leave one out");
+  };
+  for (std::size_t i = 0; i < all.size(); ++i) {
+    for (std::size_t k = 0; k < M.surfaces.size(); ++k)
+      check(all[i], "the inserted " + labelOf(M.surfaces[k].name, k + 1), M.surfaces[k].points,
+            M.surfaces[k].triangles);
+    for (std::size_t j = 0; j < i; ++j)
+      check(all[i], all[j].label, all[j].S.S.points, all[j].S.S.triangles);
+  }
+}
+
+/// 3.2 to 3.7 for one surface, with half of l_c where no way is valid.
+InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
+  constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
+  const SurfaceDistance& cleaned = candidate.S;
+  InsertReport report;
+  report.original = qualityStatistics(M);
   checkDistances(M, cleaned, options.lc);
   checkSize(M, cleaned, options.lc, options.maxTets);
 
@@ -3409,6 +3513,7 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
     throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
                       " nor at half of it, after " + std::to_string(I.faults) +
                       " tries, the last because " + I.reason + "; lower l_c");
+  std::vector<std::string> warnings = candidate.warnings;
   if (report.lc < options.lc)
     warnings.push_back("l_c was halved to " + number(report.lc) + ", because at " +
                        number(options.lc) + " no way was valid");
@@ -3417,6 +3522,40 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
   I.stage("smoothed", result);
   M = std::move(result);
   return report;
+}
+
+/// What an insertion asks of the mesh and the options before it looks at a surface.
+void checkStart(const Mesh& M, const InsertOptions& options) {
+  checkMeccano(M, "insertSurface (§3.1)");
+  checkOptions(options, M.x.size());
+  const int inverted = qualityStatistics(M).inverted;
+  if (inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(inverted) +
+                     " inverted elements; untangle it first (optimizeMesh)");
+}
+
+}  // namespace
+
+InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
+  checkStart(M, options);
+  const Candidate one = candidateOf(S, "");
+  checkApart(M, {one});
+  return insertCandidate(M, one, options);
+}
+
+std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
+                                         const InsertOptions& options) {
+  checkStart(M, options);
+  const std::vector<Candidate> all = candidatesOf(S);
+  checkApart(M, all);
+  Mesh result = M;
+  std::vector<InsertReport> reports;
+  for (const Candidate& one : all)
+    reports.push_back(labelled(one.label, [&] { return insertCandidate(result, one, options); }));
+  for (std::size_t i = 0; i < all.size(); ++i)  // later ones have refined and moved earlier ones
+    labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i]); });
+  M = std::move(result);
+  return reports;
 }
 
 }  // namespace meccano

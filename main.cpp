@@ -1196,17 +1196,21 @@ void checkInsertable(const std::string& path, const Mesh& M) {
          "as in the stages of an insertion; insert into a finished mesh");
 }
 
-void printInsertion(const InsertReport& r, const std::string& name, const Streams& io) {
-  io.out << tableI({{"original", &r.original},
-                    {"refined", &r.refined},
-                    {"projected", &r.projected},
-                    {"smoothed", &r.smoothed}})
-         << regularLine(r.regular)
-         << format(
-                "surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
-                "%.3g, Hausdorff distance %.3g\n",
-                r.surface, name.c_str(), r.lc, r.nodes, r.triangles, r.maxNodeDistance,
-                r.hausdorff);
+/// Table I: the mesh before the first surface and after the last, refined and projected for the
+/// last as in Figure 12; then a line for each surface as it is at the end.
+void printInsertion(const std::vector<InsertReport>& reports, const Mesh& M, const Streams& io) {
+  const InsertReport& last = reports.back();
+  io.out << tableI({{"original", &reports.front().original},
+                    {"refined", &last.refined},
+                    {"projected", &last.projected},
+                    {"smoothed", &last.smoothed}})
+         << regularLine(last.regular);
+  for (const InsertReport& r : reports)
+    io.out << format(
+        "surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
+        "%.3g, Hausdorff distance %.3g\n",
+        r.surface, M.surfaces[r.surface - 1].name.c_str(), r.lc, r.nodes, r.triangles,
+        r.maxNodeDistance, r.hausdorff);
 }
 
 InsertOptions insertOptions(const Arguments& a) {
@@ -1218,34 +1222,63 @@ InsertOptions insertOptions(const Arguments& a) {
 }
 
 /// The files of --stages PREFIX. Stages come once for each way of inserting that is tried; those of
-/// the way that was taken are written.
+/// the way that was taken are written. With several surfaces their number follows the prefix:
+/// PREFIX-2-projected.vtk.
 struct Stages {
   std::string prefix;  // empty: none are kept
-  int way = 0;
-  std::vector<std::pair<int, Output>> kept;  // with the way, 0: all
+  bool several = false;
+  int surface = 0, way = 0;  // under way
+  struct Kept {
+    int surface, way;  // 0: whichever
+    Output output;
+  };
+  std::vector<Kept> kept = {};
 
-  void keep(const char* name, const Mesh& M, int ofWay) {
-    if (!prefix.empty()) kept.push_back({ofWay, {prefix + "-" + name + ".vtk", vtkText(M)}});
+  void keep(const std::string& name, const Mesh& M, int ofSurface, int ofWay) {
+    if (!prefix.empty())
+      kept.push_back({ofSurface, ofWay, {prefix + '-' + name + ".vtk", vtkText(M)}});
   }
   void see(const std::string& stage, const Mesh& M) {
+    const int k = static_cast<int>(M.surfaces.size());
+    if (stage == "approximated" && k + 1 != surface) begin(k + 1);
     way += stage == "extracted";
-    if (stage == "surfaceHealed") keep("refined", M, way);  // Figure 8b: S_M is extracted
-    if (stage == "projected") keep("projected", M, way);
-    if (stage == "smoothed") keep("smoothed", M, 0);
+    const std::string number = several ? std::to_string(surface) + '-' : "";
+    if (stage == "surfaceHealed") keep(number + "refined", M, surface, way);  // Figure 8b, 11a
+    if (stage == "projected") keep(number + "projected", M, surface, way);
+    if (stage == "smoothed") keep(number + "smoothed", M, surface, 0);
   }
-  void take(int ofWay, std::vector<Output>& outputs) const {
-    for (const auto& [w, output] : kept)
-      if (w == 0 || w == ofWay) outputs.push_back(output);
+  /// Surface k, for the first time or again: what was seen of it and of later ones is void.
+  void begin(int k) {
+    surface = k;
+    way = 0;
+    kept.erase(
+        std::remove_if(kept.begin(), kept.end(), [&](const Kept& o) { return o.surface >= k; }),
+        kept.end());
+  }
+  void take(const std::vector<InsertReport>& reports, std::vector<Output>& outputs) const {
+    for (const Kept& o : kept)
+      for (const InsertReport& r : reports)
+        if (o.surface == 0 ? &r == &reports[0]
+                           : o.surface == r.surface && (o.way == 0 || o.way == r.way))
+          outputs.push_back(o.output);
   }
 };
+
+std::vector<TriangleSurface> readSurfaces(const Arguments& a, Progress& progress) {
+  std::vector<TriangleSurface> surfaces;
+  for (std::size_t i = 1; i < a.operands.size(); ++i) {
+    surfaces.push_back(readSurface(a.operands[i]));
+    const TriangleSurface& S = surfaces.back();
+    progress.line("surface " + a.operands[i] + ": " + std::to_string(S.points.size()) +
+                  " points, " + std::to_string(S.triangles.size()) + " triangles");
+  }
+  return surfaces;
+}
 
 void runInsert(const Arguments& a, const Streams& io) {
   const std::string path = a.output();
   if (!a.has("--lc")) throw UsageError("the size is missing: --lc L");
   InsertOptions options = insertOptions(a);
-  if (a.operands.size() > 2)
-    fail("insert: " + std::to_string(a.operands.size() - 1) +
-         " surfaces are given, and this version inserts one; name one");
   const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
   for (const char* stage : {"original", "refined", "projected", "smoothed"})
     if (!prefix.empty() && path == prefix + "-" + stage + ".vtk")
@@ -1254,23 +1287,23 @@ void runInsert(const Arguments& a, const Streams& io) {
   if (!prefix.empty()) checkWritable(prefix + "-original.vtk");
   Mesh M = readMesh(a.operands[0]);
   checkInsertable(a.operands[0], M);
-  const TriangleSurface S = readSurface(a.operands[1]);
   Progress progress(io, a.has("--quiet"));
   progress.line("mesh " + a.operands[0] + ": " + sizeOf(M));
-  progress.line("surface " + a.operands[1] + ": " + std::to_string(S.points.size()) + " points, " +
-                std::to_string(S.triangles.size()) + " triangles");
-  Stages stages{prefix, 0, {}};
-  stages.keep("original", M, 0);
+  const std::vector<TriangleSurface> surfaces = readSurfaces(a, progress);
+  Stages stages{prefix, surfaces.size() > 1};
+  stages.keep("original", M, 0, 0);
   options.onStage = [&](const char* stage, const Mesh& mesh) { stages.see(stage, mesh); };
   options.onProgress = [&](const std::string& line) { progress.line(line); };
   options.optimize.onSweep = [&](const Sweep& s) { progress.sweep(s); };
-  const InsertReport report = insertSurface(M, S, options);
+  const std::vector<InsertReport> reports = insertSurfaces(M, surfaces, options);
   std::vector<Output> outputs{{path, vtkText(M)}};
-  stages.take(report.way, outputs);
-  printInsertion(report, S.name, io);
+  stages.take(reports, outputs);
+  printInsertion(reports, M, io);
   if (!io.out.flush()) fail("standard output: the results cannot be written; nothing was written");
   writeFiles(outputs);
-  for (const std::string& w : report.warnings) progress.warning(w);
+  for (const InsertReport& report : reports)
+    for (const std::string& w : report.warnings)
+      progress.warning((reports.size() > 1 ? M.surfaces[report.surface - 1].name + ": " : "") + w);
   progress.line(path + ": " + sizeOf(M));
 }
 
@@ -1357,17 +1390,18 @@ const std::vector<Command>& commands() {
         {"--cells", "NX NY NZ", "cells along each axis, near-cubic ones are best (default 1 1 1)"}},
        runBox},
       {"insert",
-       "MESH.vtk SURFACE.obj",
-       "Inserts a triangulated surface into a mesh that meccano wrote, and prints Table I: the\n"
-       "quality of the original, refined, projected and smoothed mesh, against its computational\n"
-       "elements.",
+       "MESH.vtk SURFACE.obj [SURFACE.obj ...]",
+       "Inserts triangulated surfaces into a mesh that meccano wrote, one after the other, and prints\n"
+       "Table I: the quality of the original, refined, projected and smoothed mesh, against its\n"
+       "computational elements. A surface of several components becomes several.",
        2,
        1000,
        {outputOption,
         {"--lc", "L", "element size at the surface, eq. (1), in the unit of the input"},
         paperOption,
         powerOption,
-        {"--stages", "PREFIX", "also write PREFIX-{original,refined,projected,smoothed}.vtk"},
+        {"--stages", "PREFIX", "also write PREFIX-{original,refined,projected,smoothed}.vtk (of several surfaces\n"
+                       "                       PREFIX-1-refined.vtk, ...)"},
         {"--max-tets", "N", "refuse where more tetrahedra are predicted (default 20000000)"},
         quietOption},
        runInsert},

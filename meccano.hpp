@@ -339,6 +339,12 @@ std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
 ///             handle (χ ≠ 1)
 TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings);
 
+/// [§3.1 choice] The parts of S that share no point, each a surface of its own named "name.1",
+/// "name.2", ...; S itself where it is one. A warning tells of the parts.
+///   errors    InputError: an index out of range; a coordinate not finite
+std::vector<TriangleSurface> connectedComponents(const TriangleSurface& S,
+                                                 std::vector<std::string>& warnings);
+
 /// Neighbour across edge i (from vertex i to i + 1) of each triangle, -1 on the rim. [triangles]
 ///   number  [triangles], what messages call them; empty: their index
 ///   errors  InputError where three triangles share an edge
@@ -735,6 +741,14 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational)
 ///           distance to an earlier surface, too many tetrahedra; MethodError: a step cannot reach
 ///           what it promises; SolverError: a linear solve failed. M is unchanged when it throws.
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options);
+
+/// [§3, §4.2] Inserts several surfaces, in this order: all or none. A surface of several components
+/// becomes several. Nodes of earlier surfaces slide on theirs while later ones are inserted.
+///   returns a report for each surface; original and smoothed are of the mesh before and after it
+///   errors  as insertSurface, the message begins with the surface's name; InputError: two surfaces
+///           cross or touch, or one and a surface of M. M is unchanged when it throws.
+std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
+                                         const InsertOptions& options);
 
 }  // namespace meccano
 #endif
