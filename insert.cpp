@@ -1212,8 +1212,16 @@ void relaxNode(const MeccanoSurface& B, CutSolid& D, int node) {
     if (run.size() < 2) return;
     rim.put(B, run, {at}, 2 * k);
   }
-  for (int i = 0; i < 2 * count; ++i)
-    rim.corners.push_back({std::cos(pi * i / count), std::sin(pi * i / count)});
+  // Where three patches meet, each is a parallelogram with the meccano's lengths.
+  for (int k = 0; k < count; ++k) {
+    auto spoke = [&](int i) {
+      const double length = count == 3 ? B.chains[spokes[i % count] / 2].length() : 1;
+      return length * Vec2{std::cos(2 * pi * i / count), std::sin(2 * pi * i / count)};
+    };
+    const Vec2 between{std::cos(pi * (2 * k + 1) / count), std::sin(pi * (2 * k + 1) / count)};
+    rim.corners.push_back(spoke(k));
+    rim.corners.push_back(count == 3 ? spoke(k) + spoke(k + 1) : between);
+  }
 
   D.separatePaths();
   const int seed = triangleLeftOf(D, spokes[0]);
@@ -1236,7 +1244,7 @@ void relaxNode(const MeccanoSurface& B, CutSolid& D, int node) {
 /// cut again along its middle line through the triangles.
 void straightenChain(const MeccanoSurface& B, CutSolid& D, int c) {
   PolygonRim rim;
-  rim.corners = {{0, 1}, {-1, 1}, {-1, 0}, {0, 0}, {1, 0}, {1, 1}};
+  const double length = B.chains[c].length();
   for (int side = 0; side < 2; ++side) {  // the patch on the left of the chain, that on the right
     const int h = 2 * c + side;
     const std::vector<int> run = rimBetween(B.rectangles[B.rectangleLeftOf(h)], h, h);
@@ -1248,6 +1256,11 @@ void straightenChain(const MeccanoSurface& B, CutSolid& D, int c) {
     for (int k = 0; k < static_cast<int>(run.size()); ++k)
       if (dot(step(run[k]), step(h)) < -.5) opposite.push_back(k);
     rim.put(B, run, {opposite.front(), opposite.back() + 1}, 3 * side);
+    double width = 0;
+    for (int k = 0; k < opposite.front(); ++k)
+      if (std::abs(dot(step(run[k]), step(h))) < .5) width += B.chains[run[k] / 2].length();
+    const double x = side == 0 ? -width : width, y = side == 0 ? length : 0;
+    rim.corners.insert(rim.corners.end(), {{0, y}, {x, y}, {x, length - y}});
   }
   D.separatePaths();
   const int seed = triangleLeftOf(D, 2 * c);
@@ -1721,11 +1734,13 @@ BoundaryMapping getBoundaryMapping(const Meccano& C, const TriangleSurface& D) {
     return best.Pi;
   }
   std::string fault;
+  std::set<std::vector<int>> tried;
   for (int k = 0; k < 4; ++k) {
     CutSolid S = start;
     const Start kind = k % 2 == 0 ? Start::boxCorners : Start::extremes;
     try {
       placeCorners(B, k < 2 ? coordinateFrame(D) : principalFrame(D), kind, S);
+      if (!tried.insert(S.node).second) continue;
       tryPaths(B, C, std::move(S),
                std::string(kind == Start::extremes ? "extreme vertices" : "box corners") +
                    (k < 2 ? "" : " along principal axes"),
