@@ -2501,6 +2501,11 @@ std::vector<TriangleSurface> connectedComponents(const TriangleSurface& S,
   return components;
 }
 
+TriangleSurface weldSurface(const TriangleSurface& S, std::vector<std::string>& warnings) {
+  checkNumbers(S);
+  return weldAndDrop(S, warnings).S;
+}
+
 TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings) {
   checkNumbers(S);
   CleanSurface C = weldAndDrop(S, warnings);

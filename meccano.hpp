@@ -419,6 +419,12 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
 std::vector<TriangleSurface> connectedComponents(const TriangleSurface& S,
                                                  std::vector<std::string>& warnings);
 
+/// [§3.1] The first part of checkSurface() alone: exactly coincident points welded, duplicate and
+/// zero-area triangles and unused points dropped.
+///   warnings  gets one line, with the numbers
+///   errors    InputError: an index out of range; a coordinate not finite
+TriangleSurface weldSurface(const TriangleSurface& S, std::vector<std::string>& warnings);
+
 /// Neighbour across edge i (from vertex i to i + 1) of each triangle, -1 on the rim. [triangles]
 ///   number  [triangles], what messages call them; empty: their index
 ///   errors  InputError where three triangles share an edge

@@ -103,7 +103,9 @@ std::vector<TriangleSurface> surfacesOf(const Row& row, const std::string& data)
     files.insert(files.end(), found.begin(), found.end());
   }
   std::vector<TriangleSurface> surfaces;
-  for (const std::string& file : files) surfaces.push_back(readSurface(file));
+  std::vector<std::string> notes;
+  for (const std::string& file : files)
+    for (const TriangleSurface& S : readSurfaces(file, notes)) surfaces.push_back(S);
   if (row.order == Order::reversed) std::reverse(surfaces.begin(), surfaces.end());
   if (row.order == Order::largestFirst)
     std::stable_sort(
