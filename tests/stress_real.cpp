@@ -14,7 +14,7 @@
 namespace {
 
 using namespace meccano;
-using app::format, app::readSurface, app::vtkText, app::writeFiles;
+using app::format, app::readSurfaces, app::vtkText, app::writeFiles;
 namespace fs = std::filesystem;
 
 constexpr const char* help =

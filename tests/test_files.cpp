@@ -508,7 +508,9 @@ TEST_SUITE("formats") {
     const fs::path folder = fs::path(__FILE__).parent_path() / "data" / "bad";
     for (const fs::directory_entry& file : fs::directory_iterator(folder))
       CHECK_MESSAGE(rules.count(file.path().filename().string()) == 1, file.path().string());
-    for (const auto& [name, rule] : rules) {
+    for (const auto& entry : rules) {
+      const std::string& name = entry.first;
+      const Rule& rule = entry.second;
       CAPTURE(name);
       const std::string path = (folder / name).string(), suffix = suffixOf(path);
       std::vector<std::string> warnings;
