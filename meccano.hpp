@@ -268,6 +268,80 @@ struct InsertReport {
 ///   errors        InputError
 Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells);
 
+/// [§2] The boundary of a solid Ω as Algorithm 1 needs it: closed, one component, outward. Welds
+/// exactly coincident points, drops duplicate and zero-area triangles and unused points, turns
+/// triangles that disagree.
+///   D         any triangle soup; triangles and points are counted from 0 in the messages
+///   warnings  gets one line per kind of repair, and one where the surface crosses itself
+///   errors    InputError: nothing left; an index out of range; a coordinate not finite; open; a
+///             non-manifold edge or vertex; not orientable; several components; no volume
+TriangleSurface checkSolid(const TriangleSurface& D, std::vector<std::string>& warnings);
+/// Handles of a closed surface with one component.
+int genusOf(const TriangleSurface& D);
+
+/// [§2, Algorithm 1 line 2] The meccano: a union of unit cubes of the lattice (a polycube), and
+/// where its corners go.
+struct Meccano {
+  std::vector<std::array<int, 3>> cubes;  // lower corners, lattice
+  struct Placed {
+    std::array<int, 3> at;  // a corner of the polycube, lattice
+    Vec3 x;                 // near its place on the solid, length unit of the input
+  };
+  std::vector<Placed> corners;  // all corners of the polycube; empty: found by getBoundaryMapping
+  Vec3 cube{1, 1, 1};           // physical edge lengths of a cube, for sizes
+};
+
+/// [Algorithm 1, line 2] A box of cubes in the integer ratios of the solid's principal lengths.
+///   D       has passed checkSolid()
+///   errors  InputError: genus above zero, which needs the user's polycube and corners
+Meccano getMeccano(const TriangleSurface& D);
+
+/// [Algorithm 1, line 3] Π on the boundary: patches, curves and corners as in Mesh, and where each
+/// lies on the meccano's boundary. [choice] A patch is a maximal flat part of it, so that nodes
+/// slide freely where the meccano is flat; triangles are counter-clockwise in 𝓤.
+struct BoundaryMapping {
+  std::vector<Parametrization> patches;  // patch p is patches[p-1]; with locators
+  std::vector<Curve> curves;             // curve c is curves[c-1]: a straight edge of the meccano
+  std::vector<Corner> corners;           // corner c is corners[c-1]
+  /// 𝓤 is the bounding rectangle of the patch: u runs along axis + 1, v along axis + 2 (modulo 3).
+  struct Rectangle {
+    std::array<int, 3> lo, hi;  // lattice, lo[axis] = hi[axis]
+    int axis, side;             // outward normal -e_axis (side 0) or +e_axis (side 1)
+  };
+  struct Segment {
+    std::array<int, 3> from, to;  // lattice, ascending
+  };
+  std::vector<Rectangle> rectangles;           // [patches]
+  std::vector<Segment> segments;               // [curves], from s = 0
+  std::vector<std::array<int, 3>> cornersAt;   // [corners], lattice
+  std::vector<std::string> notes;              // what was chosen, for a progress display
+};
+/// Π on the boundary: a box without placed corners is cut into its sides automatically, a polycube
+/// with placed corners along shortest paths between them.
+///   C, D    D has passed checkSolid()
+///   errors  InputError: the polycube's boundary is no connected manifold, or its genus is not the
+///           solid's; corners missing, too far from the solid or twice at one vertex;
+///           MethodError: paths or patches cannot be found; SolverError
+BoundaryMapping getBoundaryMapping(const Meccano& C, const TriangleSurface& D);
+
+/// Π at a point of the meccano's boundary, as the arrays of Mesh hold it.
+struct BoundaryPoint {
+  int dimension, entity;  // 2 and -p on a patch, 1 and c on a curve, 0 and c at a corner
+  Vec2 parameter;
+  Vec3 x;
+};
+/// Π(ξ). errors: MethodError where xi is not on the meccano's boundary
+BoundaryPoint boundaryPoint(const BoundaryMapping& Pi, Vec3 xi);
+
+/// [Algorithm 1, line 4] The six Kuhn tetrahedra of each cube, boundary nodes at Π, inner ones
+/// placed by placeInterior(). The lattice is moved so that its lowest coordinates are 0.
+Mesh getInitialMesh(const Meccano& C, const BoundaryMapping& Pi);
+/// [§2 choice] Moves the inner nodes to the harmonic image of the computational mesh: linear finite
+/// elements in xi, conjugate gradients. For any mesh with computational coordinates; no element is
+/// promised to be valid.
+///   errors  SolverError
+void placeInterior(Mesh& M);
+
 /// [§3.2, after 17] Bisects each tetrahedron of E once, after its neighbours where conformity asks
 /// for it. Child 0 keeps the parent's index, child 1 is appended; new nodes are midpoints, on
 /// surfaces and curves the parametric ones [choice]. Lists of tetrahedra stay valid, but name half
