@@ -8,7 +8,9 @@
 #include <cstdio>
 #include <map>
 #include <numeric>
+#include <queue>
 #include <set>
+#include <tuple>
 
 #include "meccano.hpp"
 
@@ -76,6 +78,36 @@ int localIndex(const std::array<int, 4>& tet, int n) {
   for (int i = 0; i < 4; ++i)
     if (tet[i] == n) return i;
   return -1;
+}
+
+std::string placeText(Vec3 p) {
+  char text[96];
+  std::snprintf(text, sizeof text, "(%.9g, %.9g, %.9g)", p.x, p.y, p.z);
+  return text;
+}
+
+std::string counted(std::size_t n, const std::string& one) {
+  return std::to_string(n) + ' ' + one + (n == 1 ? "" : "s");
+}
+
+/// Disjoint sets of 0 .. n - 1, each named after its lowest member.
+struct Parts {
+  std::vector<int> parent;
+  explicit Parts(std::size_t n) : parent(n) { std::iota(parent.begin(), parent.end(), 0); }
+  int of(int i) {
+    while (parent[i] != i) i = parent[i] = parent[parent[i]];
+    return i;
+  }
+  void join(int i, int j) {
+    i = of(i);
+    j = of(j);
+    parent[std::max(i, j)] = std::min(i, j);
+  }
+};
+
+/// Corner of a triangle at point n: 0, 1, 2.
+int cornerAt(const std::array<int, 3>& triangle, int n) {
+  return static_cast<int>(std::find(triangle.begin(), triangle.end(), n) - triangle.begin());
 }
 
 }  // namespace
@@ -318,8 +350,9 @@ void addBoxNode(Mesh& M, std::array<int, 3> i, std::array<int, 3> n, Vec3 size) 
 }
 
 /// Six Kuhn tetrahedra of the cell at i: one for each path x0 x1 x2 x3 along the axes.
-void addKuhnCell(Mesh& M, std::array<int, 3> i, std::array<int, 3> n) {
-  auto node = [&](std::array<int, 3> p) { return (p[2] * (n[1] + 1) + p[1]) * (n[0] + 1) + p[0]; };
+///   node   number of a lattice point;  label  of the cell's side (axis, 0 or 1)
+template <class Node, class Label>
+void addKuhnCell(Mesh& M, std::array<int, 3> i, Node node, Label label) {
   constexpr int paths[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2}, {1, 2, 0}, {2, 0, 1}, {2, 1, 0}};
   for (const auto& path : paths) {
     std::array<int, 3> p = i;
@@ -331,10 +364,7 @@ void addKuhnCell(Mesh& M, std::array<int, 3> i, std::array<int, 3> n) {
     }
     M.tets.push_back({x[0], x[3], x[2], x[1]});
     // x0 lies on the lower sides, x3 on the upper ones: the faces without x3 or without x0
-    std::array<int, 4> label{0, 0, 0, 0};
-    if (i[path[0]] + 1 == n[path[0]]) label[0] = -boxPatch(path[0], 1);
-    if (i[path[2]] == 0) label[1] = -boxPatch(path[2], 0);
-    M.faceLabel.push_back(label);
+    M.faceLabel.push_back({label(path[0], 1), label(path[2], 0), 0, 0});
   }
 }
 
@@ -361,7 +391,16 @@ Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells) {
       }
   for (int k = 0; k < cells[2]; ++k)
     for (int j = 0; j < cells[1]; ++j)
-      for (int i = 0; i < cells[0]; ++i) addKuhnCell(M, {i, j, k}, cells);
+      for (int i = 0; i < cells[0]; ++i)
+        addKuhnCell(
+            M, {i, j, k},
+            [&](std::array<int, 3> p) {
+              return (p[2] * (cells[1] + 1) + p[1]) * (cells[0] + 1) + p[0];
+            },
+            [&](int axis, int side) {
+              const int at = std::array<int, 3>{i, j, k}[axis];
+              return at == side * (cells[axis] - 1) ? -boxPatch(axis, side) : 0;
+            });
   M.type.assign(M.tets.size(), 0);
   M.level.assign(M.tets.size(), 0);
   M.cube = {size.x / cells[0], size.y / cells[1], size.z / cells[2]};
@@ -370,6 +409,1497 @@ Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells) {
     throw InputError(
         "boxMesh: origin and size leave no digits for the cells; move or scale the box");
   return M;
+}
+
+// ==== 2. Meccano: the boundary of a polycube =====================================================
+
+namespace {
+
+using LatticePoint = std::array<int, 3>;
+
+LatticePoint moved(LatticePoint p, int axis, int by) {
+  p[axis] += by;
+  return p;
+}
+
+/// Lattice points in the order of boxMesh's nodes.
+bool precedes(const LatticePoint& a, const LatticePoint& b) {
+  return std::tie(a[2], a[1], a[0]) < std::tie(b[2], b[1], b[0]);
+}
+
+Vec3 latticeVector(const LatticePoint& p) { return {double(p[0]), double(p[1]), double(p[2])}; }
+
+std::string latticeText(const LatticePoint& p) {
+  return "(" + std::to_string(p[0]) + " " + std::to_string(p[1]) + " " + std::to_string(p[2]) + ")";
+}
+
+/// A unit square of the meccano's boundary with outward normal -e_axis (side 0) or +e_axis (1).
+struct UnitSquare {
+  LatticePoint lo;
+  int axis, side;
+  int region = -1, rectangle = -1;
+  /// Corner e of four, counter-clockwise from outside.
+  LatticePoint corner(int e) const {
+    const int u = (axis + 1) % 3, v = (axis + 2) % 3;
+    LatticePoint p = lo;
+    if (e == 2 || e == (side == 1 ? 1 : 3)) ++p[u];
+    if (e == 2 || e == (side == 1 ? 3 : 1)) ++p[v];
+    return p;
+  }
+};
+
+/// A straight edge between two nodes of the net on the meccano's boundary. Half-chain 2 c runs along
+/// chain c, half-chain 2 c + 1 against it.
+struct Chain {
+  LatticePoint end[2];
+  int node[2];
+  bool cut;  // inside a flat region
+  int length() const {
+    return std::abs(end[1][0] - end[0][0]) + std::abs(end[1][1] - end[0][1]) +
+           std::abs(end[1][2] - end[0][2]);
+  }
+};
+
+/// A rectangle of unit squares; a flat region's bounding rectangle.
+struct LatticeRectangle {
+  LatticePoint lo, hi;
+  int axis, side;
+  int region;
+  std::vector<int> rim;  // half-chains, counter-clockwise from outside
+};
+
+/// The meccano's boundary: flat regions, cut into rectangles where they are none, and the net of
+/// chains around the rectangles.
+struct MeccanoSurface {
+  std::vector<UnitSquare> squares;
+  std::map<std::pair<LatticePoint, LatticePoint>, int> half;  // unit edge -> 4 square + edge
+  std::vector<LatticeRectangle> regions, rectangles;
+  std::vector<LatticePoint> nodes;
+  std::vector<char> isCorner;            // [nodes], of the polycube; else where a cut ends
+  std::vector<Chain> chains;
+  std::vector<std::vector<int>> around;  // [nodes], half-chains that leave it, counter-clockwise
+  int genus = 0;
+
+  explicit MeccanoSurface(const Meccano& C);
+  int squareLeftOf(const LatticePoint& p, const LatticePoint& q) const {
+    return half.at({p, q}) / 4;
+  }
+  LatticePoint start(int h) const { return chains[h / 2].end[h % 2]; }
+  int startNode(int h) const { return chains[h / 2].node[h % 2]; }
+  int rectangleLeftOf(int h) const;
+
+ private:
+  using UnitEdges = std::set<std::pair<LatticePoint, LatticePoint>>;  // in both directions
+  UnitEdges net_;
+  void addSquares(const Meccano& C);
+  void checkManifold();
+  void join(bool regions);
+  std::vector<LatticePoint> spokes(const LatticePoint& p) const;
+  void cutRegions();
+  void addNodes();
+  void addChains();
+  void addRims();
+};
+
+[[noreturn]] void refuseMeccano(const std::string& what) {
+  throw InputError("getBoundaryMapping (§2): " + what);
+}
+
+void MeccanoSurface::addSquares(const Meccano& C) {
+  constexpr int largest = 1000;  // of the lattice, as boxMesh
+  if (C.cubes.empty()) refuseMeccano("the polycube has no cubes; give at least one");
+  LatticePoint lo = C.cubes[0], hi = lo;
+  for (const LatticePoint& c : C.cubes)
+    for (int a = 0; a < 3; ++a) lo[a] = std::min(lo[a], c[a]), hi[a] = std::max(hi[a], c[a]);
+  for (int a = 0; a < 3; ++a)
+    if (std::int64_t(hi[a]) - lo[a] >= largest)
+      refuseMeccano("the polycube is longer than 1000 cubes along axis " + std::to_string(a) +
+                    "; use fewer, larger cubes");
+  const std::set<LatticePoint> cubes(C.cubes.begin(), C.cubes.end());
+  for (int axis = 0; axis < 3; ++axis)
+    for (int side = 0; side < 2; ++side)
+      for (const LatticePoint& c : cubes)
+        if (cubes.count(moved(c, axis, side ? 1 : -1)) == 0)
+          squares.push_back({moved(c, axis, side), axis, side});
+}
+
+/// Each unit edge in two squares, each point with one fan of squares, one component.
+void MeccanoSurface::checkManifold() {
+  std::map<LatticePoint, int> squaresAt;
+  for (int s = 0; s < static_cast<int>(squares.size()); ++s)
+    for (int e = 0; e < 4; ++e) {
+      const LatticePoint p = squares[s].corner(e), q = squares[s].corner((e + 1) % 4);
+      ++squaresAt[p];
+      if (!half.insert({{p, q}, 4 * s + e}).second)
+        refuseMeccano("the polycube's boundary is no manifold at the edge from " + latticeText(p) +
+                      " to " + latticeText(q) +
+                      ": two cubes touch only there; add a cube beside them or remove one");
+    }
+  for (const auto& [edge, square] : half)
+    if (static_cast<int>(spokes(edge.first).size()) != squaresAt[edge.first])
+      refuseMeccano("the polycube's boundary is no manifold at the point " +
+                    latticeText(edge.first) +
+                    ": cubes touch only there; add a cube beside them or remove one");
+  Parts parts(squares.size());
+  for (const auto& [edge, square] : half)
+    parts.join(square / 4, squareLeftOf(edge.second, edge.first));
+  int components = 0;
+  for (int s = 0; s < static_cast<int>(squares.size()); ++s) components += parts.of(s) == s;
+  if (components > 1)
+    refuseMeccano("the polycube's boundary has " + std::to_string(components) +
+                  " components; its cubes must hang together by faces, without an inner hollow");
+  const int euler = static_cast<int>(squaresAt.size()) - static_cast<int>(half.size() / 2) +
+                    static_cast<int>(squares.size());
+  genus = (2 - euler) / 2;
+}
+
+/// The neighbours of a boundary point, counter-clockwise from outside.
+std::vector<LatticePoint> MeccanoSurface::spokes(const LatticePoint& p) const {
+  constexpr std::size_t most = 8;  // at a manifold point there are six
+  std::vector<LatticePoint> ring;
+  const auto first = half.lower_bound({p, LatticePoint{-(1 << 30), 0, 0}});
+  LatticePoint q = first->first.second;
+  do {
+    ring.push_back(q);
+    const int at = half.at({p, q});
+    q = squares[at / 4].corner((at + 3) % 4);
+  } while (q != first->first.second && ring.size() < most);
+  return ring;
+}
+
+/// Groups squares: into flat regions, or into rectangles between the edges of the net.
+void MeccanoSurface::join(bool flat) {
+  Parts parts(squares.size());
+  for (const auto& [edge, at] : half) {
+    const int s = at / 4, other = squareLeftOf(edge.second, edge.first);
+    const UnitSquare &a = squares[s], &b = squares[other];
+    if (flat ? a.axis == b.axis && a.side == b.side : net_.count(edge) == 0) parts.join(s, other);
+  }
+  std::vector<LatticeRectangle>& groups = flat ? regions : rectangles;
+  std::vector<int> group(squares.size(), -1);
+  for (int s = 0; s < static_cast<int>(squares.size()); ++s) {
+    UnitSquare& q = squares[s];
+    const int first = parts.of(s);
+    if (first == s) {
+      group[s] = static_cast<int>(groups.size());
+      groups.push_back({q.lo, q.lo, q.axis, q.side, flat ? group[s] : q.region, {}});
+    }
+    LatticeRectangle& R = groups[group[first]];
+    for (int a = 0; a < 3; ++a) {
+      R.lo[a] = std::min(R.lo[a], q.lo[a]);
+      R.hi[a] = std::max(R.hi[a], q.lo[a] + (a == q.axis ? 0 : 1));
+    }
+    (flat ? q.region : q.rectangle) = group[first];
+  }
+}
+
+/// The net starts with the edges between flat regions. [choice] From each point where a region has
+/// an inner angle of 270° a cut runs to the net, the shorter way: what is left are rectangles.
+void MeccanoSurface::cutRegions() {
+  auto regionAt = [&](const LatticePoint& p, const LatticePoint& q) {
+    return squares[squareLeftOf(p, q)].region;
+  };
+  std::map<std::pair<LatticePoint, int>, int> squaresAt;  // of each region, at each point
+  for (const auto& [edge, at] : half) {
+    ++squaresAt[{edge.first, squares[at / 4].region}];
+    if (squares[at / 4].region != regionAt(edge.second, edge.first)) net_.insert(edge);
+  }
+  auto onNet = [&](const LatticePoint& p) {
+    const std::vector<LatticePoint> ring = spokes(p);
+    return std::any_of(ring.begin(), ring.end(),
+                       [&](const LatticePoint& q) { return net_.count({p, q}) > 0; });
+  };
+  for (const auto& [at, count] : squaresAt) {
+    if (count != 3) continue;
+    const LatticePoint p = at.first;
+    std::vector<LatticePoint> best;
+    bool isCut = false;
+    for (const LatticePoint& q : spokes(p)) {
+      if (regionAt(p, q) != at.second || regionAt(q, p) != at.second) continue;
+      isCut |= net_.count({p, q}) > 0;
+      std::vector<LatticePoint> way{p, q};
+      while (!onNet(way.back())) {
+        LatticePoint next = way.back();
+        for (int a = 0; a < 3; ++a) next[a] += q[a] - p[a];
+        way.push_back(next);
+      }
+      if (best.empty() || way.size() < best.size()) best = way;
+    }
+    for (std::size_t i = 0; i + 1 < best.size() && !isCut; ++i) {
+      net_.insert({best[i], best[i + 1]});
+      net_.insert({best[i + 1], best[i]});
+    }
+  }
+}
+
+/// Where three or more edges of the net meet.
+void MeccanoSurface::addNodes() {
+  std::map<LatticePoint, std::array<int, 2>> degree;  // of the net; without cuts
+  for (const auto& [p, q] : net_) {
+    ++degree[p][0];
+    degree[p][1] += squares[squareLeftOf(p, q)].region != squares[squareLeftOf(q, p)].region;
+  }
+  for (const auto& [p, d] : degree)
+    if (d[0] > 2) nodes.push_back(p);
+  std::sort(nodes.begin(), nodes.end(), precedes);
+  for (const LatticePoint& p : nodes) isCorner.push_back(degree[p][1] > 2);
+}
+
+void MeccanoSurface::addChains() {
+  std::map<LatticePoint, int> nodeAt;
+  for (int n = 0; n < static_cast<int>(nodes.size()); ++n) nodeAt[nodes[n]] = n;
+  for (int axis = 0; axis < 3; ++axis) {
+    const std::size_t first = chains.size();
+    for (const auto& [p, n] : nodeAt) {
+      LatticePoint q = moved(p, axis, 1);
+      if (net_.count({p, q}) == 0) continue;
+      const bool cut = squares[squareLeftOf(p, q)].region == squares[squareLeftOf(q, p)].region;
+      while (nodeAt.count(q) == 0) ++q[axis];
+      chains.push_back({{p, q}, {n, nodeAt[q]}, cut});
+    }
+    std::sort(chains.begin() + first, chains.end(), [axis](const Chain& a, const Chain& b) {
+      const int v = (axis + 2) % 3, u = (axis + 1) % 3;
+      return std::tie(a.end[0][v], a.end[0][u], a.end[0][axis]) <
+             std::tie(b.end[0][v], b.end[0][u], b.end[0][axis]);
+    });
+  }
+  around.resize(nodes.size());
+  for (int n = 0; n < static_cast<int>(nodes.size()); ++n)
+    for (const LatticePoint& q : spokes(nodes[n]))
+      for (int h = 0; h < static_cast<int>(2 * chains.size()); ++h) {
+        const LatticePoint &a = start(h), &b = start(h ^ 1);
+        if (a != nodes[n]) continue;
+        LatticePoint step;
+        for (int i = 0; i < 3; ++i) step[i] = a[i] + (b[i] > a[i]) - (b[i] < a[i]);
+        if (step == q) around[n].push_back(h);
+      }
+}
+
+int MeccanoSurface::rectangleLeftOf(int h) const {
+  const LatticePoint &a = start(h), &b = start(h ^ 1);
+  LatticePoint q;
+  for (int i = 0; i < 3; ++i) q[i] = a[i] + (b[i] > a[i]) - (b[i] < a[i]);
+  return squares[squareLeftOf(a, q)].rectangle;
+}
+
+/// Around each rectangle: after half-chain h comes the one before its reverse, seen around the node.
+void MeccanoSurface::addRims() {
+  std::vector<char> seen(2 * chains.size(), 0);
+  for (int first = 0; first < static_cast<int>(seen.size()); ++first) {
+    std::vector<int> rim;
+    for (int h = first; !seen[h];) {
+      seen[h] = 1;
+      rim.push_back(h);
+      const std::vector<int>& spokesThere = around[startNode(h ^ 1)];
+      const auto back = std::find(spokesThere.begin(), spokesThere.end(), h ^ 1);
+      h = back == spokesThere.begin() ? spokesThere.back() : *(back - 1);
+    }
+    if (!rim.empty()) rectangles[rectangleLeftOf(first)].rim = rim;
+  }
+}
+
+MeccanoSurface::MeccanoSurface(const Meccano& C) {
+  addSquares(C);
+  checkManifold();
+  join(true);
+  cutRegions();
+  addNodes();
+  addChains();
+  join(false);
+  addRims();
+}
+
+}  // namespace
+
+// ==== Tools for 2: Floater's equations solved by elimination ======================================
+
+namespace {
+
+/// Elimination order of the points not fixed: halves along the longest side of their box, then the
+/// points of the lower half that have a neighbour in the upper one (nested dissection, George 1973).
+void appendDissection(const std::vector<Vec3>& points, const SparseMatrix& lambda,
+                      std::vector<int> part, std::vector<char>& upper, std::vector<int>& order) {
+  constexpr std::size_t leaf = 8;  // [choice] points that are not divided further
+  if (part.size() <= leaf) {
+    order.insert(order.end(), part.begin(), part.end());
+    return;
+  }
+  Vec3 lo = points[part[0]], hi = lo;
+  for (int n : part) {
+    const Vec3 p = points[n];
+    lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
+    hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
+  }
+  const Vec3 l = hi - lo;
+  const int axis = l.x >= l.y && l.x >= l.z ? 0 : l.y >= l.z ? 1 : 2;
+  const auto middle = part.begin() + part.size() / 2;
+  std::nth_element(part.begin(), middle, part.end(), [&](int a, int b) {
+    const double ca = component(points[a], axis), cb = component(points[b], axis);
+    return ca != cb ? ca < cb : a < b;
+  });
+  std::vector<int> low, high(middle, part.end()), separator;
+  for (int n : high) upper[n] = 1;
+  for (auto n = part.begin(); n != middle; ++n) {
+    bool touches = false;
+    for (int k = lambda.start[*n]; k < lambda.start[*n + 1]; ++k)
+      touches |= upper[lambda.column[k]] != 0;
+    (touches ? separator : low).push_back(*n);
+  }
+  for (int n : high) upper[n] = 0;
+  appendDissection(points, lambda, low, upper, order);
+  appendDissection(points, lambda, high, upper, order);
+  order.insert(order.end(), separator.begin(), separator.end());
+}
+
+/// The weights left in each row when the earlier ones are eliminated, in elimination order.
+struct Elimination {
+  std::vector<int> point, row;            // point of each row; row of each point, -1 where fixed
+  std::vector<std::vector<int>> later;    // columns after the diagonal, ascending
+  std::vector<std::vector<double>> weight;
+  std::vector<double> rim;                // weight that leads to fixed points
+  std::vector<Vec2> pull;                 // Σ weight u of these
+};
+
+/// Where the eliminated rows have entries: those of the row itself, and of the rows whose first
+/// entry it is.
+Elimination eliminationPattern(const std::vector<Vec3>& points, const SparseMatrix& lambda,
+                               const std::vector<char>& fixed) {
+  Elimination L;
+  std::vector<int> inner;
+  for (int n = 0; n < static_cast<int>(points.size()); ++n)
+    if (!fixed[n]) inner.push_back(n);
+  std::vector<char> upper(points.size(), 0);
+  appendDissection(points, lambda, inner, upper, L.point);
+  L.row.assign(points.size(), -1);
+  const int rows = static_cast<int>(L.point.size());
+  for (int i = 0; i < rows; ++i) L.row[L.point[i]] = i;
+  L.later.resize(rows);
+  std::vector<int> seen(rows, -1);
+  std::vector<std::vector<int>> children(rows);
+  for (int i = 0; i < rows; ++i) {
+    std::vector<int>& columns = L.later[i];
+    auto add = [&](int j) {
+      if (j <= i || seen[j] == i) return;
+      seen[j] = i;
+      columns.push_back(j);
+    };
+    for (int k = lambda.start[L.point[i]]; k < lambda.start[L.point[i] + 1]; ++k)
+      add(L.row[lambda.column[k]]);
+    for (int child : children[i])
+      for (int j : L.later[child]) add(j);
+    std::sort(columns.begin(), columns.end());
+    if (!columns.empty()) children[columns[0]].push_back(i);
+  }
+  return L;
+}
+
+/// u_i = Σ λ_ij u_j at the points not fixed. Rows are eliminated without any subtraction (Grassmann,
+/// Taksar, Heyman 1985): the diagonal is the sum of what is left in the row, so that every weight is
+/// exact to rounding, however far a point is from the rim.
+void solveConvexCombinations(const std::vector<Vec3>& points, const SparseMatrix& lambda,
+                             const std::vector<char>& fixed, std::vector<Vec2>& u) {
+  Elimination L = eliminationPattern(points, lambda, fixed);
+  const int rows = static_cast<int>(L.point.size());
+  L.weight.resize(rows);
+  L.rim.assign(rows, 0);
+  L.pull.assign(rows, {});
+  std::vector<std::vector<int>> earlier(rows);  // rows k with an entry in column i, ascending
+  for (int k = 0; k < rows; ++k)
+    for (int j : L.later[k]) earlier[j].push_back(k);
+  std::vector<double> diagonal(rows), w(rows, 0.0);
+  for (int i = 0; i < rows; ++i) {
+    for (int k = lambda.start[L.point[i]]; k < lambda.start[L.point[i] + 1]; ++k) {
+      const int n = lambda.column[k];
+      if (!fixed[n]) {
+        w[L.row[n]] += lambda.value[k];
+        continue;
+      }
+      L.rim[i] += lambda.value[k];
+      L.pull[i] = L.pull[i] + lambda.value[k] * u[n];
+    }
+    for (int k : earlier[i]) {  // row i takes row k's weights in the place of its own on k
+      const double part = std::exchange(w[k], 0.0) / diagonal[k];
+      const std::vector<int>& columns = L.later[k];
+      for (std::size_t c = 0; c < columns.size(); ++c) w[columns[c]] += part * L.weight[k][c];
+      L.rim[i] += part * L.rim[k];
+      L.pull[i] = L.pull[i] + part * L.pull[k];
+    }
+    w[i] = 0;  // the way back to i itself only scales the row
+    diagonal[i] = L.rim[i];
+    for (int j : L.later[i]) {
+      diagonal[i] += w[j];
+      L.weight[i].push_back(std::exchange(w[j], 0.0));
+    }
+  }
+  for (int i = rows - 1; i >= 0; --i) {
+    Vec2 sum = L.pull[i];
+    for (std::size_t c = 0; c < L.later[i].size(); ++c)
+      sum = sum + L.weight[i][c] * u[L.point[L.later[i][c]]];
+    u[L.point[i]] = (1 / diagonal[i]) * sum;
+  }
+}
+
+}  // namespace
+
+// ==== 2. Algorithm 1: Π on the boundary ===========================================================
+
+namespace {
+
+/// The solid's boundary while it is cut along the chains of the meccano: split edges only, so its
+/// geometry stays.
+struct CutSolid {
+  std::vector<Vec3> points;
+  std::vector<std::array<int, 3>> triangles;
+  std::vector<std::array<int, 3>> neighbours;  // across edge i, from vertex i to i + 1
+  std::vector<std::array<int, 3>> halfChain;   // 1 + half-chain along edge i, 0 none
+  std::vector<int> triangleOf;                 // [points], a triangle at it
+  std::vector<char> onPath;                    // [points], on a chain or at a node
+  std::vector<int> node;                       // [nodes], point of each
+  std::vector<std::vector<int>> path;          // [chains], points from end 0 to end 1; empty: none yet
+
+  explicit CutSolid(const TriangleSurface& D)
+      : points(D.points),
+        triangles(D.triangles),
+        neighbours(triangleNeighbours(D)),
+        halfChain(D.triangles.size(), {0, 0, 0}),
+        triangleOf(D.points.size(), -1),
+        onPath(D.points.size(), 0) {
+    for (int t = 0; t < static_cast<int>(triangles.size()); ++t)
+      for (int n : triangles[t]) triangleOf[n] = t;
+  }
+  /// Calls visit(t, i) for the triangles around point n counter-clockwise: n is vertex i of t.
+  template <class Visit>
+  void aroundPoint(int n, Visit visit) const {
+    int t = triangleOf[n];
+    do {
+      const int i = cornerAt(triangles[t], n);
+      visit(t, i);
+      t = neighbours[t][(i + 2) % 3];
+    } while (t != triangleOf[n]);
+  }
+  int splitEdge(int t, int i, double part);
+  void separatePaths();
+  void markPath(int c, bool on);
+  void clearPath(int c);
+};
+
+/// A new point at this part of edge i of triangle t, counted from vertex i.
+int CutSolid::splitEdge(int t, int i, double part) {
+  const int s = neighbours[t][i], a = triangles[t][i], b = triangles[t][(i + 1) % 3];
+  const int j = cornerAt(triangles[s], b);  // s is (b, a, d) from vertex j
+  const int c = triangles[t][(i + 2) % 3], d = triangles[s][(j + 2) % 3];
+  const int m = static_cast<int>(points.size()), t1 = static_cast<int>(triangles.size());
+  const int s1 = t1 + 1;
+  auto rotated = [](std::array<int, 3> v, int by) {
+    std::rotate(v.begin(), v.begin() + by, v.end());
+    return v;
+  };
+  const std::array<int, 3> nt = rotated(neighbours[t], i), ns = rotated(neighbours[s], j);
+  const std::array<int, 3> ht = rotated(halfChain[t], i), hs = rotated(halfChain[s], j);
+  points.push_back(points[a] + part * (points[b] - points[a]));
+  triangles[t] = {a, m, c}, neighbours[t] = {s1, t1, nt[2]}, halfChain[t] = {ht[0], 0, ht[2]};
+  triangles[s] = {b, m, d}, neighbours[s] = {t1, s1, ns[2]}, halfChain[s] = {hs[0], 0, hs[2]};
+  triangles.push_back({m, b, c}), neighbours.push_back({s, nt[1], t});
+  halfChain.push_back({ht[0], ht[1], 0});
+  triangles.push_back({m, a, d}), neighbours.push_back({t, ns[1], s});
+  halfChain.push_back({hs[0], hs[1], 0});
+  auto redirect = [&](int from, int to, int x) {  // the triangle beyond the edge from x
+    if (from != t && from != s) neighbours[from][(cornerAt(triangles[from], x) + 2) % 3] = to;
+  };
+  redirect(nt[1], t1, b);
+  redirect(ns[1], s1, a);
+  triangleOf.push_back(t);
+  onPath.push_back(0);
+  triangleOf[a] = t;
+  triangleOf[b] = s;
+  triangleOf[c] = t;
+  triangleOf[d] = s;
+  return m;
+}
+
+/// Splits each edge of no path that joins two points of paths: afterwards a path finds its way
+/// between others, and no triangle of a patch is flat in 𝓤.
+void CutSolid::separatePaths() {
+  for (int t = 0; t < static_cast<int>(triangles.size()); ++t)
+    for (int i = 0; i < 3; ++i) {
+      const int a = triangles[t][i], b = triangles[t][(i + 1) % 3];
+      if (onPath[a] && onPath[b] && halfChain[t][i] == 0) splitEdge(t, i, .5);
+    }
+}
+
+/// Marks the edges of path c, from both sides, or wipes the marks.
+void CutSolid::markPath(int c, bool on) {
+  for (std::size_t k = 0; k + 1 < path[c].size(); ++k) {
+    const int a = path[c][k], b = path[c][k + 1];
+    aroundPoint(a, [&](int t, int i) {
+      if (triangles[t][(i + 1) % 3] == b) halfChain[t][i] = on ? 2 * c + 1 : 0;
+      if (triangles[t][(i + 2) % 3] == b) halfChain[t][(i + 2) % 3] = on ? 2 * c + 2 : 0;
+    });
+    if (k > 0) onPath[a] = on;
+  }
+}
+
+void CutSolid::clearPath(int c) {
+  markPath(c, false);
+  path[c].clear();
+}
+
+/// The points next to the start of half-chain h where its path may leave: between the traced paths
+/// before and after it in the order around the node.
+std::vector<int> allowedSector(const MeccanoSurface& B, const CutSolid& D, int h) {
+  const std::vector<int>& spokes = B.around[B.startNode(h)];
+  const int count = static_cast<int>(spokes.size());
+  const int at = static_cast<int>(std::find(spokes.begin(), spokes.end(), h) - spokes.begin());
+  auto tracedFrom = [&](int step) {  // half-chain + 1
+    for (int k = 1; k < count; ++k) {
+      const int other = spokes[(at + k * step + count * count) % count];
+      if (!D.path[other / 2].empty()) return other + 1;
+    }
+    return 0;
+  };
+  const int before = tracedFrom(-1), after = tracedFrom(1);
+  std::vector<int> ring, leaves;  // points around, and the half-chain + 1 that leaves towards each
+  D.aroundPoint(D.node[B.startNode(h)], [&](int t, int i) {
+    ring.push_back(D.triangles[t][(i + 1) % 3]);
+    leaves.push_back(D.halfChain[t][i]);
+  });
+  if (before == 0) return ring;
+  std::vector<int> allowed;
+  const int size = static_cast<int>(ring.size());
+  const int first =
+      static_cast<int>(std::find(leaves.begin(), leaves.end(), before) - leaves.begin());
+  for (int k = 1; k < size && leaves[(first + k) % size] != after; ++k)
+    allowed.push_back(ring[(first + k) % size]);
+  return allowed;
+}
+
+/// Dijkstra: the shortest way along edges from A to Z through points that are on no path and, where
+/// given, usable; it starts at one of `first`, ends after one of `last`. Empty: there is none.
+std::vector<int> shortestPath(const CutSolid& D, int A, int Z, const std::vector<int>& first,
+                              const std::vector<int>& last, const std::vector<char>& usable) {
+  std::vector<double> distance(D.points.size(), 1e300);
+  std::vector<int> from(D.points.size(), -1);
+  std::vector<char> isLast(D.points.size(), 0);
+  for (int n : last) isLast[n] = 1;
+  using Entry = std::pair<double, int>;
+  std::priority_queue<Entry, std::vector<Entry>, std::greater<Entry>> queue;
+  auto reach = [&](int a, int n, double d) {
+    if (d >= distance[n] || (n != Z && (D.onPath[n] || (!usable.empty() && !usable[n])))) return;
+    distance[n] = d;
+    from[n] = a;
+    queue.push({d, n});
+  };
+  for (int n : first)
+    if (n != Z) reach(A, n, norm(D.points[n] - D.points[A]));
+  while (!queue.empty() && queue.top().second != Z) {
+    const double d = queue.top().first;
+    const int n = queue.top().second;
+    queue.pop();
+    if (d > distance[n]) continue;
+    D.aroundPoint(n, [&](int t, int i) {
+      const int next = D.triangles[t][(i + 1) % 3];
+      if (next != Z || isLast[n]) reach(n, next, d + norm(D.points[next] - D.points[n]));
+    });
+  }
+  if (from[Z] < 0) return {};
+  std::vector<int> path{Z};
+  while (path.back() != A) path.push_back(from[path.back()]);
+  std::reverse(path.begin(), path.end());
+  return path;
+}
+
+/// The shortest path for chain c in the order around its nodes. False: there is none.
+bool tracePath(const MeccanoSurface& B, CutSolid& D, int c, const std::vector<char>& usable = {}) {
+  const int A = D.node[B.chains[c].node[0]], Z = D.node[B.chains[c].node[1]];
+  D.path[c] = shortestPath(D, A, Z, allowedSector(B, D, 2 * c), allowedSector(B, D, 2 * c + 1),
+                           usable);
+  D.markPath(c, true);
+  return !D.path[c].empty();
+}
+
+/// Traces these chains, none of which has a path; one that is blocked goes first and all start again.
+void tracePaths(const MeccanoSurface& B, CutSolid& D, std::vector<int> order) {
+  const std::size_t maxStarts = 4 * order.size() + 4;  // each chain a few times first
+  for (std::size_t start = 0; start < maxStarts; ++start) {
+    std::size_t k = 0;
+    for (; k < order.size(); ++k) {
+      D.separatePaths();
+      if (!tracePath(B, D, order[k])) break;
+    }
+    if (k == order.size()) return;
+    for (std::size_t j = 0; j < k; ++j) D.clearPath(order[j]);
+    std::rotate(order.begin(), order.begin() + k, order.begin() + k + 1);
+  }
+  const Chain& c = B.chains[order[0]];
+  throw MethodError("getBoundaryMapping (§2): no path on the solid from the corner at " +
+                    placeText(D.points[D.node[c.node[0]]]) + " to the one at " +
+                    placeText(D.points[D.node[c.node[1]]]) + ", meccano edge " +
+                    latticeText(c.end[0]) + " to " + latticeText(c.end[1]) +
+                    ", that does not cross the others; place the corners in the order of the "
+                    "polycube's, or add cubes");
+}
+
+/// A disk cut out of the solid along chains.
+struct Disk {
+  std::vector<Vec3> points;                   // [points]
+  std::vector<std::array<int, 3>> triangles;  // of these
+  std::vector<int> vertex, triangle;          // their numbers in the CutSolid
+  struct RimPoint {
+    int point, half;  // half-chain along which the rim leaves it
+    double part;      // of the half-chain, by arc length
+  };
+  std::vector<RimPoint> rim;  // counter-clockwise, from the start of a half-chain
+  std::vector<char> isRim;
+  std::vector<Vec2> u;
+};
+
+/// Cuts open at the chains: numbers of the disk's points, one for each fan of triangles around a
+/// point between chains.
+void openAtChains(const CutSolid& D, const std::vector<int>& localOf, Disk& P) {
+  P.triangles.assign(P.triangle.size(), {-1, -1, -1});
+  for (std::size_t l = 0; l < P.triangle.size(); ++l)
+    for (int i = 0; i < 3; ++i) {
+      if (P.triangles[l][i] >= 0) continue;
+      const int n = D.triangles[P.triangle[l]][i], number = static_cast<int>(P.vertex.size());
+      P.vertex.push_back(n);
+      P.points.push_back(D.points[n]);
+      for (int direction : {2, 0}) {  // counter-clockwise across edge i + 2, clockwise across edge i
+        for (int t = P.triangle[l];;) {
+          const int k = cornerAt(D.triangles[t], n), e = (k + direction) % 3;
+          P.triangles[localOf[t]][k] = number;
+          if (D.halfChain[t][e] != 0) break;
+          t = D.neighbours[t][e];
+          if (t == P.triangle[l]) break;
+        }
+      }
+    }
+}
+
+/// The rim as one loop, with its parts by arc length.
+void walkRim(const CutSolid& D, Disk& P) {
+  std::vector<int> next(P.points.size(), -1), half(P.points.size(), 0);
+  std::size_t edges = 0;
+  for (std::size_t l = 0; l < P.triangle.size(); ++l)
+    for (int i = 0; i < 3; ++i)
+      if (const int h = D.halfChain[P.triangle[l]][i]; h != 0) {
+        next[P.triangles[l][i]] = P.triangles[l][(i + 1) % 3];
+        half[P.triangles[l][i]] = h - 1;
+        ++edges;
+      }
+  P.isRim.assign(P.points.size(), 0);
+  int first = -1;  // a node: the half-chain changes there
+  for (int n = 0; n < static_cast<int>(next.size()) && first < 0; ++n)
+    if (next[n] >= 0 && half[n] != half[next[n]]) first = next[n];
+  for (int n = first; n >= 0 && P.rim.size() <= edges && !P.isRim[n]; n = next[n]) {
+    P.isRim[n] = 1;
+    const bool starts = P.rim.empty() || P.rim.back().half != half[n];
+    const double before = starts ? 0 : P.rim.back().part;
+    const double step = starts ? 0 : norm(P.points[n] - P.points[P.rim.back().point]);
+    P.rim.push_back({n, half[n], before + step});
+  }
+  const int euler = static_cast<int>(P.points.size()) -
+                    static_cast<int>(3 * P.triangles.size() + edges) / 2 +
+                    static_cast<int>(P.triangles.size());
+  if (first < 0 || P.rim.size() != edges || euler != 1)
+    throw MethodError("getBoundaryMapping (§2): a patch of the solid at " +
+                      placeText(P.points[0]) +
+                      " is no disk; place the corners in the order of the polycube's, or add "
+                      "cubes");
+  for (std::size_t k = P.rim.size(); k-- > 0;) {  // lengths to parts
+    const std::size_t after = (k + 1) % P.rim.size();
+    std::size_t from = k;
+    if (P.rim[after].half == P.rim[k].half) continue;
+    while (from > 0 && P.rim[from - 1].half == P.rim[k].half) --from;
+    const double length =
+        P.rim[k].part + norm(P.points[P.rim[after].point] - P.points[P.rim[k].point]);
+    for (std::size_t j = from; j <= k; ++j) P.rim[j].part /= length;
+  }
+}
+
+/// The disk of triangles around triangle t up to chains.
+Disk diskAt(const CutSolid& D, int t) {
+  Disk P;
+  std::vector<int> localOf(D.triangles.size(), -1);
+  P.triangle.push_back(t);
+  localOf[t] = 0;
+  for (std::size_t q = 0; q < P.triangle.size(); ++q)
+    for (int i = 0; i < 3; ++i) {
+      const int s = D.neighbours[P.triangle[q]][i];
+      if (D.halfChain[P.triangle[q]][i] != 0 || localOf[s] >= 0) continue;
+      localOf[s] = static_cast<int>(P.triangle.size());
+      P.triangle.push_back(s);
+    }
+  openAtChains(D, localOf, P);
+  walkRim(D, P);
+  return P;
+}
+
+/// A triangle to the left of the path of half-chain h.
+int triangleLeftOf(const CutSolid& D, int h) {
+  const std::vector<int>& path = D.path[h / 2];
+  int found = -1;
+  D.aroundPoint(path[0], [&](int t, int i) {
+    if (D.triangles[t][(i + 1) % 3] == path[1] && h % 2 == 0) found = t;
+    if (D.triangles[t][(i + 2) % 3] == path[1] && h % 2 == 1) found = t;
+  });
+  return found;
+}
+
+/// [§2, after 18] Floater's map of a disk, its rim where rimU(half-chain, part) says.
+template <class RimU>
+void flatten(Disk& P, RimU rimU) {
+  P.u.assign(P.points.size(), {});
+  for (const Disk::RimPoint& r : P.rim) P.u[r.point] = rimU(r.half, r.part);
+  const SparseMatrix lambda = meanValueWeights(P.points, P.triangles, P.isRim);
+  solveConvexCombinations(P.points, lambda, P.isRim, P.u);
+}
+
+/// Where the half-chains of a rim go on a polygon: the perimeter coordinate at the start and at the
+/// end of each, whole numbers at the polygon's corners.
+struct PolygonRim {
+  std::map<int, std::array<double, 2>> at;  // of half-chains
+  std::vector<Vec2> corners;
+  Vec2 operator()(int half, double part) const {
+    const std::array<double, 2>& ends = at.find(half)->second;
+    const double tau = ends[0] + part * (ends[1] - ends[0]);
+    const int n = static_cast<int>(corners.size());
+    const int i = std::min(static_cast<int>(tau), n - 1);
+    return corners[i] + (tau - i) * (corners[(i + 1) % n] - corners[i]);
+  }
+  /// Puts a run of half-chains from corner `first` on along polygon sides: run[breaks[k]] starts at
+  /// corner first + k + 1. On a side by lattice length.
+  void put(const MeccanoSurface& B, const std::vector<int>& run, const std::vector<int>& breaks,
+           int first) {
+    std::vector<int> ends{0};
+    ends.insert(ends.end(), breaks.begin(), breaks.end());
+    ends.push_back(static_cast<int>(run.size()));
+    for (std::size_t side = 0; side + 1 < ends.size(); ++side) {
+      double total = 0, before = 0;
+      for (int k = ends[side]; k < ends[side + 1]; ++k) total += B.chains[run[k] / 2].length();
+      for (int k = ends[side]; k < ends[side + 1]; ++k) {
+        const double corner = first + static_cast<int>(side), start = corner + before / total;
+        before += B.chains[run[k] / 2].length();
+        at[run[k]] = {start, corner + before / total};
+      }
+    }
+  }
+};
+
+/// The half-chains of a rectangle's rim after `leave`, up to `stop`.
+std::vector<int> rimBetween(const LatticeRectangle& R, int leave, int stop) {
+  std::vector<int> run = R.rim;
+  std::rotate(run.begin(), std::find(run.begin(), run.end(), leave) + 1, run.end());
+  run.erase(std::find(run.begin(), run.end(), stop), run.end());
+  return run;
+}
+
+/// [choice] Moves a node to the middle of the patches around it: their fan is mapped onto a regular
+/// polygon, two sides for each patch, and the spokes are traced again from its centre.
+void relaxNode(const MeccanoSurface& B, CutSolid& D, int node) {
+  constexpr double pi = 3.14159265358979323846;
+  const std::vector<int>& spokes = B.around[node];
+  const int count = static_cast<int>(spokes.size());
+  PolygonRim rim;
+  for (int k = 0; k < count; ++k) {
+    const int out = spokes[k], back = spokes[(k + 1) % count] ^ 1;
+    const std::vector<int> run = rimBetween(B.rectangles[B.rectangleLeftOf(out)], out, back);
+    int total = 0, before = 0, at = 1, best = 1 << 30;
+    for (int h : run) total += B.chains[h / 2].length();
+    for (int i = 1; i < static_cast<int>(run.size()); ++i) {
+      before += B.chains[run[i - 1] / 2].length();
+      if (std::abs(2 * before - total) < best) best = std::abs(2 * before - total), at = i;
+    }
+    if (run.size() < 2) return;
+    rim.put(B, run, {at}, 2 * k);
+  }
+  // Where three patches meet, each is a parallelogram with the meccano's lengths.
+  for (int k = 0; k < count; ++k) {
+    auto spoke = [&](int i) {
+      const double length = count == 3 ? B.chains[spokes[i % count] / 2].length() : 1;
+      return length * Vec2{std::cos(2 * pi * i / count), std::sin(2 * pi * i / count)};
+    };
+    const Vec2 between{std::cos(pi * (2 * k + 1) / count), std::sin(pi * (2 * k + 1) / count)};
+    rim.corners.push_back(spoke(k));
+    rim.corners.push_back(count == 3 ? spoke(k) + spoke(k + 1) : between);
+  }
+
+  D.separatePaths();
+  const int seed = triangleLeftOf(D, spokes[0]);
+  std::vector<std::vector<int>> old;
+  for (int h : spokes) old.push_back(D.path[h / 2]), D.clearPath(h / 2);
+  D.onPath[D.node[node]] = 0;
+  Disk P = diskAt(D, seed);
+  flatten(P, rim);
+  int best = -1;
+  for (int n = 0; n < static_cast<int>(P.u.size()); ++n)
+    if (!P.isRim[n] && (best < 0 || norm(P.u[n]) < norm(P.u[best]))) best = n;
+  D.node[node] = P.vertex[best];
+  D.onPath[D.node[node]] = 1;
+  std::vector<int> chains;
+  for (int h : spokes) chains.push_back(h / 2);
+  tracePaths(B, D, chains);
+}
+
+/// [choice] Draws a chain straight: the two patches beside it are mapped onto a 2 x 1 rectangle and
+/// cut again along its middle line through the triangles.
+void straightenChain(const MeccanoSurface& B, CutSolid& D, int c) {
+  PolygonRim rim;
+  const double length = B.chains[c].length();
+  for (int side = 0; side < 2; ++side) {  // the patch on the left of the chain, that on the right
+    const int h = 2 * c + side;
+    const std::vector<int> run = rimBetween(B.rectangles[B.rectangleLeftOf(h)], h, h);
+    auto step = [&](int half) {
+      Vec3 d = latticeVector(B.start(half ^ 1)) - latticeVector(B.start(half));
+      return (1 / norm(d)) * d;
+    };
+    std::vector<int> opposite;
+    for (int k = 0; k < static_cast<int>(run.size()); ++k)
+      if (dot(step(run[k]), step(h)) < -.5) opposite.push_back(k);
+    rim.put(B, run, {opposite.front(), opposite.back() + 1}, 3 * side);
+    double width = 0;
+    for (int k = 0; k < opposite.front(); ++k)
+      if (std::abs(dot(step(run[k]), step(h))) < .5) width += B.chains[run[k] / 2].length();
+    const double x = side == 0 ? -width : width, y = side == 0 ? length : 0;
+    rim.corners.insert(rim.corners.end(), {{0, y}, {x, y}, {x, length - y}});
+  }
+  D.separatePaths();
+  const int seed = triangleLeftOf(D, 2 * c);
+  const std::vector<int> old = D.path[c];
+  D.clearPath(c);
+  Disk P = diskAt(D, seed);
+  flatten(P, rim);
+
+  // Points of the middle line: near ones are taken for it, crossed edges are split.
+  constexpr double snap = .1;     // [choice] part of an edge within which its end is taken
+  constexpr double onLine = 1e-9; // of the rectangle's width: rounding
+  std::vector<double> x(P.u.size());
+  std::vector<char> usable(D.points.size(), 0);
+  for (std::size_t n = 0; n < x.size(); ++n) {
+    x[n] = P.u[n].x;
+    if (!P.isRim[n] && std::abs(x[n]) < onLine) x[n] = 0;
+    if (P.vertex[n] == old.front() || P.vertex[n] == old.back()) x[n] = P.isRim[n] && std::abs(x[n]) < onLine ? 0 : x[n];
+  }
+  auto crossing = [&](int a, int b) { return x[a] * x[b] < 0 ? x[a] / (x[a] - x[b]) : -1; };
+  for (const std::array<int, 3>& t : P.triangles)
+    for (int i = 0; i < 3; ++i) {
+      const int a = t[i], b = t[(i + 1) % 3];
+      const double part = crossing(a, b);
+      if (part >= 0 && part < snap && !P.isRim[a]) x[a] = 0;
+      if (part > 1 - snap && !P.isRim[b]) x[b] = 0;
+    }
+  for (std::size_t n = 0; n < x.size(); ++n)
+    if (x[n] == 0) usable[P.vertex[n]] = 1;
+  std::map<std::pair<int, int>, double> crossed;  // edges of the solid, lower point first
+  for (const std::array<int, 3>& t : P.triangles)
+    for (int i = 0; i < 3; ++i) {
+      const int a = t[i], b = t[(i + 1) % 3];
+      if (crossing(a, b) >= 0 && P.vertex[a] < P.vertex[b])
+        crossed[{P.vertex[a], P.vertex[b]}] = std::clamp(crossing(a, b), snap, 1 - snap);
+    }
+  for (const auto& [edge, part] : crossed) {
+    int t0 = -1, i0 = -1;
+    D.aroundPoint(edge.first, [&, b = edge.second](int t, int i) {
+      if (D.triangles[t][(i + 1) % 3] == b && D.halfChain[t][i] == 0) t0 = t, i0 = i;
+    });
+    if (t0 >= 0) D.splitEdge(t0, i0, part), usable.push_back(1);
+  }
+  if (tracePath(B, D, c, usable)) return;
+  tracePaths(B, D, {c});
+}
+
+}  // namespace
+
+namespace {
+
+/// Directions that the meccano's axes take in space, with the solid's extents along them.
+struct Frame {
+  std::array<Vec3, 3> axis;
+  Vec3 lo, hi;
+  Vec3 coordinates(Vec3 x) const { return {dot(axis[0], x), dot(axis[1], x), dot(axis[2], x)}; }
+  Vec3 size() const { return hi - lo; }
+};
+
+Frame frameAlong(const std::array<Vec3, 3>& axis, const TriangleSurface& D) {
+  Frame F{axis, {}, {}};
+  F.lo = F.hi = F.coordinates(D.points[0]);
+  for (const Vec3& p : D.points) {
+    const Vec3 c = F.coordinates(p);
+    F.lo = {std::min(F.lo.x, c.x), std::min(F.lo.y, c.y), std::min(F.lo.z, c.z)};
+    F.hi = {std::max(F.hi.x, c.x), std::max(F.hi.y, c.y), std::max(F.hi.z, c.z)};
+  }
+  return F;
+}
+
+Frame coordinateFrame(const TriangleSurface& D) {
+  return frameAlong({{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, D);
+}
+
+/// Eigenvectors of a symmetric matrix by cyclic Jacobi rotations, as columns.
+std::array<Vec3, 3> eigenvectors(std::array<std::array<double, 3>, 3> A) {
+  constexpr int sweeps = 30;  // quadratic convergence: 6 reach rounding
+  std::array<std::array<double, 3>, 3> V{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
+  for (int sweep = 0; sweep < sweeps; ++sweep)
+    for (int p = 0; p < 2; ++p)
+      for (int q = p + 1; q < 3; ++q) {
+        if (A[p][q] == 0) continue;
+        const double theta = (A[q][q] - A[p][p]) / (2 * A[p][q]);
+        const double t = (theta < 0 ? -1 : 1) / (std::abs(theta) + std::sqrt(theta * theta + 1));
+        const double c = 1 / std::sqrt(t * t + 1), s = t * c;
+        for (int k = 0; k < 3; ++k) {
+          const double kp = A[k][p], kq = A[k][q];
+          A[k][p] = c * kp - s * kq, A[k][q] = s * kp + c * kq;
+        }
+        for (int k = 0; k < 3; ++k) {
+          const double pk = A[p][k], qk = A[q][k];
+          A[p][k] = c * pk - s * qk, A[q][k] = s * pk + c * qk;
+          const double vp = V[k][p], vq = V[k][q];
+          V[k][p] = c * vp - s * vq, V[k][q] = s * vp + c * vq;
+        }
+      }
+  std::array<Vec3, 3> columns;
+  for (int i = 0; i < 3; ++i) columns[i] = {V[0][i], V[1][i], V[2][i]};
+  return columns;
+}
+
+/// Principal axes of the surface's area, each near the coordinate axis of its number.
+Frame principalFrame(const TriangleSurface& D) {
+  double area = 0;
+  Vec3 centre;
+  for (const std::array<int, 3>& t : D.triangles) {
+    const Vec3 a = D.points[t[0]], b = D.points[t[1]], c = D.points[t[2]];
+    const double A = norm(cross(b - a, c - a));
+    area += A;
+    centre += (A / 3) * (a + b + c);
+  }
+  centre = (1 / area) * centre;
+  std::array<std::array<double, 3>, 3> moments{};
+  for (const std::array<int, 3>& t : D.triangles) {
+    const Vec3 a = D.points[t[0]], b = D.points[t[1]], c = D.points[t[2]];
+    const double A = norm(cross(b - a, c - a)) / area;
+    for (const Vec3& p : {.5 * (a + b), .5 * (b + c), .5 * (c + a)})  // exact for squares
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j)
+          moments[i][j] += A / 3 * component(p - centre, i) * component(p - centre, j);
+  }
+  const std::array<Vec3, 3> e = eigenvectors(moments);
+  std::array<int, 3> order{0, 1, 2}, best = order;
+  double fit = -1;
+  do {
+    double sum = 0;
+    for (int a = 0; a < 3; ++a) sum += std::abs(component(e[order[a]], a));
+    if (sum > fit + 1e-9) fit = sum, best = order;  // rounding decides nothing
+  } while (std::next_permutation(order.begin(), order.end()));
+  std::array<Vec3, 3> axis;
+  for (int a = 0; a < 3; ++a) axis[a] = component(e[best[a]], a) < 0 ? -e[best[a]] : e[best[a]];
+  if (dot(cross(axis[0], axis[1]), axis[2]) < 0) axis[2] = -axis[2];
+  return frameAlong(axis, D);
+}
+
+double volumeOf(Vec3 size) { return size.x * size.y * size.z; }
+
+/// [choice] The coordinate axes, unless the box along the principal ones is clearly smaller.
+Frame preferredFrame(const TriangleSurface& D) {
+  constexpr double clearly = .8;  // of the volume
+  const Frame F = coordinateFrame(D), G = principalFrame(D);
+  return volumeOf(G.size()) < clearly * volumeOf(F.size()) ? G : F;
+}
+
+}  // namespace
+
+Meccano getMeccano(const TriangleSurface& D) {
+  if (const int genus = genusOf(D); genus > 0)
+    throw InputError("getMeccano (§2): the solid has " + counted(genus, "handle") +
+                     ", and only solids without handles get their meccano automatically; give a "
+                     "polycube of the same genus with its corners (--polycube FILE)");
+  constexpr double mostCubes = 12;  // along an axis: thinner solids get longer cubes
+  const Vec3 size = preferredFrame(D).size();
+  const double shortest = std::min({size.x, size.y, size.z});
+  const double unit = std::max(shortest, std::max({size.x, size.y, size.z}) / mostCubes);
+  std::array<int, 3> n;
+  for (int a = 0; a < 3; ++a)
+    n[a] = std::max(1, static_cast<int>(std::lround(component(size, a) / unit)));
+  Meccano C;
+  for (int k = 0; k < n[2]; ++k)
+    for (int j = 0; j < n[1]; ++j)
+      for (int i = 0; i < n[0]; ++i) C.cubes.push_back({i, j, k});
+  C.cube = {size.x / n[0], size.y / n[1], size.z / n[2]};
+  return C;
+}
+
+namespace {
+
+/// How the corners of an automatic meccano find their points of the solid.
+enum class Start { boxCorners, extremes };
+
+/// The point of D not yet taken that has the lowest cost.
+template <class Cost>
+int cheapestPoint(const CutSolid& D, Cost cost) {
+  int best = -1;
+  double lowest = 1e300;
+  for (int n = 0; n < static_cast<int>(D.points.size()); ++n) {
+    if (D.onPath[n]) continue;
+    const double c = cost(D.points[n]);
+    if (c < lowest) lowest = c, best = n;
+  }
+  if (best < 0)
+    throw MethodError(
+        "getBoundaryMapping (§2): the solid has fewer points than the meccano has corners; refine "
+        "its surface");
+  return best;
+}
+
+void placeCorners(const MeccanoSurface& B, const Frame& F, Start start, CutSolid& D) {
+  constexpr double shrink = .9;  // [choice] of the box: its corners then look at the solid
+  LatticePoint lo = B.nodes[0], hi = lo;
+  for (const LatticePoint& p : B.nodes)
+    for (int a = 0; a < 3; ++a) lo[a] = std::min(lo[a], p[a]), hi[a] = std::max(hi[a], p[a]);
+  for (std::size_t n = 0; n < B.nodes.size(); ++n) {
+    if (!B.isCorner[n]) continue;
+    double f[3];  // place in the box, from -1 to 1
+    for (int a = 0; a < 3; ++a) f[a] = 2. * (B.nodes[n][a] - lo[a]) / (hi[a] - lo[a]) - 1;
+    const Vec3 size = F.size(), middle = .5 * (F.lo + F.hi);
+    const Vec3 target = middle + .5 * shrink * Vec3{f[0] * size.x, f[1] * size.y, f[2] * size.z};
+    D.node[n] = cheapestPoint(D, [&](Vec3 x) {
+      const Vec3 c = F.coordinates(x);
+      if (start == Start::boxCorners) return norm2(c - target);
+      const Vec3 d = c - middle;
+      return -(f[0] * d.x / size.x + f[1] * d.y / size.y + f[2] * d.z / size.z);
+    });
+    D.onPath[D.node[n]] = 1;
+  }
+}
+
+/// The user's corners at the nearest points of the solid.
+void placeCorners(const MeccanoSurface& B, const Meccano& C, CutSolid& D) {
+  constexpr double farthest = .25;  // [choice] of the diagonal: farther is another place
+  const Vec3 size = coordinateFrame({D.points, {}, {}}).size();
+  std::map<LatticePoint, int> nodeAt;
+  for (std::size_t n = 0; n < B.nodes.size(); ++n)
+    if (B.isCorner[n]) nodeAt[B.nodes[n]] = static_cast<int>(n);
+  std::vector<int> placedBy(D.points.size(), -1);
+  for (std::size_t k = 0; k < C.corners.size(); ++k) {
+    const LatticePoint at = C.corners[k].at;
+    const Vec3 x = C.corners[k].x;
+    const std::string what = "corner " + latticeText(at);
+    if (!isFinite(x)) refuseMeccano(what + " has a place that is not finite");
+    if (nodeAt.count(at) == 0)
+      refuseMeccano(what + " is no corner of the polycube: three or more of its edges must meet "
+                           "there; remove it or correct its numbers");
+    int best = 0;
+    for (int n = 0; n < static_cast<int>(D.points.size()); ++n)
+      if (norm2(D.points[n] - x) < norm2(D.points[best] - x)) best = n;
+    if (!(norm(D.points[best] - x) <= farthest * norm(size)))
+      refuseMeccano(what + " is placed at " + placeText(x) + ", " +
+                    number(norm(D.points[best] - x)) + " from the solid, more than " +
+                    number(farthest) + " of its diagonal; place it near the solid");
+    int& node = D.node[nodeAt[at]];
+    if (node >= 0) refuseMeccano(what + " is placed twice; keep one place");
+    if (placedBy[best] >= 0)
+      refuseMeccano(what + " and corner " + latticeText(C.corners[placedBy[best]].at) +
+                    " are both placed at the solid's vertex " + placeText(D.points[best]) +
+                    "; place them farther apart, or refine the solid's surface there");
+    node = best;
+    placedBy[best] = static_cast<int>(k);
+    D.onPath[best] = 1;
+  }
+  for (const auto& [at, n] : nodeAt)
+    if (D.node[n] < 0)
+      refuseMeccano("corner " + latticeText(at) +
+                    " of the polycube has no place on the solid; add a line `corner " +
+                    std::to_string(at[0]) + " " + std::to_string(at[1]) + " " +
+                    std::to_string(at[2]) + " x y z`");
+}
+
+/// The half-chain that goes on straight from the end of h; -1 where a corner is there.
+int straightOn(const MeccanoSurface& B, int h) {
+  const int node = B.startNode(h ^ 1);
+  if (B.isCorner[node]) return -1;
+  for (int g : B.around[node])
+    if (g != (h ^ 1) && !B.chains[g / 2].cut == !B.chains[h / 2].cut) return g;
+  return -1;
+}
+
+/// Ends of cuts go on the shortest way between the corners of their meccano edge, by length.
+void placeCutEnds(const MeccanoSurface& B, CutSolid& D) {
+  for (int h = 0; h < static_cast<int>(2 * B.chains.size()); h += 2) {
+    if (B.chains[h / 2].cut || !B.isCorner[B.startNode(h)]) continue;
+    std::vector<int> run{h};
+    double total = B.chains[h / 2].length();
+    while (straightOn(B, run.back()) >= 0) {
+      run.push_back(straightOn(B, run.back()));
+      total += B.chains[run.back() / 2].length();
+    }
+    if (run.size() < 2) continue;
+    const int A = D.node[B.startNode(h)], Z = D.node[B.startNode(run.back() ^ 1)];
+    std::vector<int> first;
+    D.aroundPoint(A, [&](int t, int i) { first.push_back(D.triangles[t][(i + 1) % 3]); });
+    std::vector<int> last;
+    D.aroundPoint(Z, [&](int t, int i) { last.push_back(D.triangles[t][(i + 1) % 3]); });
+    const std::vector<int> path = shortestPath(D, A, Z, first, last, {});
+    std::vector<double> s{0};
+    for (std::size_t k = 1; k < path.size(); ++k)
+      s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
+    if (path.size() < run.size() + 1)
+      throw MethodError("getBoundaryMapping (§2): the solid's surface is too coarse between " +
+                        placeText(D.points[A]) + " and " + placeText(D.points[Z]) +
+                        "; refine it there");
+    double before = 0;
+    std::size_t k = 0;
+    for (std::size_t r = 0; r + 1 < run.size(); ++r) {
+      before += B.chains[run[r] / 2].length();
+      const std::size_t mostLeft = path.size() - (run.size() - r);  // one point for each later end
+      ++k;
+      while (k < mostLeft && s[k] < before / total * s.back()) ++k;
+      D.node[B.startNode(run[r + 1])] = path[k];
+      D.onPath[path[k]] = 1;
+    }
+  }
+}
+
+/// Position along a half-chain in the lattice.
+Vec3 latticeAt(const MeccanoSurface& B, int h, double part) {
+  const Vec3 a = latticeVector(B.start(h)), b = latticeVector(B.start(h ^ 1));
+  return a + part * (b - a);
+}
+
+Vec2 inRectangle(const BoundaryMapping::Rectangle& R, Vec3 p) {
+  const int u = (R.axis + 1) % 3, v = (R.axis + 2) % 3;
+  return {(component(p, u) - R.lo[u]) / (R.hi[u] - R.lo[u]),
+          (component(p, v) - R.lo[v]) / (R.hi[v] - R.lo[v])};
+}
+
+/// Each rectangle by Floater onto its place; those of one flat region are one patch.
+void addPatches(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) {
+  std::map<std::tuple<int, int>, int> sides;  // regions with the same normal
+  for (const LatticeRectangle& R : B.regions) {
+    const int number = ++sides[{R.axis, R.side}];
+    Parametrization P;
+    P.name = std::string(1, "xyz"[R.axis]) + (R.side ? "+" : "-");
+    if (number > 1) P.name += std::to_string(number);
+    Pi.rectangles.push_back({R.lo, R.hi, R.axis, R.side});
+    Pi.patches.push_back(P);
+  }
+  std::vector<std::map<int, int>> pointOf(B.regions.size());  // of the solid's points
+  for (const LatticeRectangle& R : B.rectangles) {
+    Parametrization& P = Pi.patches[R.region];
+    const BoundaryMapping::Rectangle& place = Pi.rectangles[R.region];
+    Disk disk = diskAt(D, triangleLeftOf(D, R.rim[0]));
+    flatten(disk, [&](int h, double part) { return inRectangle(place, latticeAt(B, h, part)); });
+    for (std::array<int, 3> t : disk.triangles) {
+      for (int& n : t) {
+        const auto [it, isNew] =
+            pointOf[R.region].insert({disk.vertex[n], static_cast<int>(P.points.size())});
+        if (isNew) P.points.push_back(disk.points[n]), P.u.push_back(disk.u[n]);
+        n = it->second;
+      }
+      if (R.side == 0) std::swap(t[1], t[2]);
+      P.triangles.push_back(t);
+    }
+  }
+  for (Parametrization& P : Pi.patches) {
+    const std::vector<int> flipped = flippedTriangles(P.triangles, P.u);
+    if (!flipped.empty())
+      throw MethodError("getBoundaryMapping (§2): Floater's map of patch '" + P.name +
+                        "' folds: " + counted(flipped.size(), "parametric triangle") +
+                        ", the first at " + placeText(P.points[P.triangles[flipped[0]][0]]) +
+                        "; place the corners so that no part of the solid is squashed, or remesh "
+                        "its surface there");
+    buildLocator(P);
+  }
+}
+
+/// The meccano's edges as curves, its corners.
+void addCurves(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) {
+  std::map<int, int> cornerOf;  // of nodes
+  for (int n = 0; n < static_cast<int>(B.nodes.size()); ++n) {
+    if (!B.isCorner[n]) continue;
+    cornerOf[n] = static_cast<int>(Pi.corners.size());
+    Pi.corners.push_back({D.points[D.node[n]], {}});
+    Pi.cornersAt.push_back(B.nodes[n]);
+  }
+  for (int h = 0; h < static_cast<int>(2 * B.chains.size()); h += 2) {
+    if (B.chains[h / 2].cut || !B.isCorner[B.startNode(h)]) continue;
+    Curve C;
+    int regions[2] = {B.rectangles[B.rectangleLeftOf(h)].region,
+                      B.rectangles[B.rectangleLeftOf(h ^ 1)].region};
+    int axis = 0;
+    while (B.start(h)[axis] == B.start(h ^ 1)[axis]) ++axis;
+    if (B.regions[regions[0]].axis != (axis + 1) % 3) std::swap(regions[0], regions[1]);
+    for (int r : regions) C.sides.push_back({-(r + 1), {}});
+    auto add = [&](int point, Vec3 xi) {
+      const double step = C.points.empty() ? 0 : norm(D.points[point] - C.points.back());
+      C.s.push_back(C.s.empty() ? 0 : C.s.back() + step);
+      C.points.push_back(D.points[point]);
+      for (int i = 0; i < 2; ++i)
+        C.sides[i].u.push_back(inRectangle(Pi.rectangles[regions[i]], xi));
+    };
+    int last = h;
+    for (int g = h; g >= 0; last = g, g = straightOn(B, g)) {
+      const std::vector<int>& path = D.path[g / 2];
+      std::vector<double> s{0};
+      for (std::size_t k = 1; k < path.size(); ++k)
+        s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
+      for (std::size_t k = 0; k + 1 < path.size(); ++k)
+        add(path[k], latticeAt(B, g, s[k] / s.back()));
+    }
+    add(D.node[B.startNode(last ^ 1)], latticeVector(B.start(last ^ 1)));
+    Pi.curves.push_back(C);
+    Pi.segments.push_back({B.start(h), B.start(last ^ 1)});
+    const int number = static_cast<int>(Pi.curves.size());
+    Pi.corners[cornerOf[B.startNode(h)]].on.push_back({number, 0});
+    Pi.corners[cornerOf[B.startNode(last ^ 1)]].on.push_back({number, C.s.back()});
+  }
+}
+
+BoundaryMapping mappingOf(const MeccanoSurface& B, const CutSolid& D) {
+  BoundaryMapping Pi;
+  addPatches(B, D, Pi);
+  addCurves(B, D, Pi);
+  return Pi;
+}
+
+/// A way to cut the solid, and how good its mapping is.
+struct Attempt {
+  BoundaryMapping Pi;
+  int inverted = 0;
+  double mean = -1;  // of q; -1: none yet
+};
+
+/// Keeps the better mapping: fewer inverted elements after the first placement of the interior on
+/// the meccano's mesh refined a few times, then the higher mean quality.
+void keepBetter(const Meccano& C, BoundaryMapping Pi, const std::string& way, Attempt& best) {
+  constexpr std::size_t enough = 2500;  // [choice] elements that tell mappings apart
+  Mesh M = getInitialMesh(C, Pi);
+  while (M.tets.size() < enough) {
+    std::vector<int> all(M.tets.size());
+    std::iota(all.begin(), all.end(), 0);
+    bisect(M, all);
+  }
+  placeInterior(M);
+  const QualityStatistics q = qualityStatistics(M);
+  const bool better = best.mean < 0 || q.inverted < best.inverted ||
+                      (q.inverted == best.inverted && q.mean > best.mean);
+  std::vector<std::string> notes = std::move(best.Pi.notes);
+  notes.push_back("§2: " + way + ": " + std::to_string(q.inverted) + " of " +
+                  std::to_string(q.tetrahedra) + " elements inverted, mean q " + number(q.mean));
+  if (better) {
+    best.Pi = std::move(Pi);
+    best.inverted = q.inverted;
+    best.mean = q.mean;
+  }
+  best.Pi.notes = std::move(notes);
+}
+
+/// From corners that are placed: paths as they are, drawn straight, corners relaxed and then drawn
+/// straight.
+void tryPaths(const MeccanoSurface& B, const Meccano& C, CutSolid D, const std::string& way,
+              Attempt& best) {
+  placeCutEnds(B, D);
+  std::vector<int> chains(B.chains.size());
+  std::iota(chains.begin(), chains.end(), 0);
+  tracePaths(B, D, chains);
+  auto straighten = [&](CutSolid& S) {
+    for (int c : chains) straightenChain(B, S, c);
+    S.separatePaths();
+    return mappingOf(B, S);
+  };
+  CutSolid raw = D;
+  raw.separatePaths();
+  keepBetter(C, mappingOf(B, raw), way + ", shortest paths", best);
+  CutSolid straight = D;
+  keepBetter(C, straighten(straight), way + ", straightened", best);
+  for (int n = 0; n < static_cast<int>(B.nodes.size()); ++n) relaxNode(B, D, n);
+  keepBetter(C, straighten(D), way + ", relaxed and straightened", best);
+}
+
+}  // namespace
+
+BoundaryMapping getBoundaryMapping(const Meccano& C, const TriangleSurface& D) {
+  const MeccanoSurface B(C);
+  const int genus = genusOf(D);
+  if (genus != B.genus)
+    refuseMeccano("the solid has " + counted(genus, "handle") + " and the polycube " +
+                  std::to_string(B.genus) + "; give a polycube of the same genus");
+  if (genus > 0 && C.corners.empty())
+    refuseMeccano("the solid has " + counted(genus, "handle") +
+                  ", which needs the places of the polycube's corners; add a line `corner i j k x y "
+                  "z` for each");
+  CutSolid start(D);
+  start.node.assign(B.nodes.size(), -1);
+  start.path.resize(B.chains.size());
+  Attempt best;
+  if (!C.corners.empty()) {
+    placeCorners(B, C, start);
+    tryPaths(B, C, start, "placed corners", best);
+    return best.Pi;
+  }
+  std::string fault;
+  std::set<std::vector<int>> tried;
+  for (int k = 0; k < 4; ++k) {
+    CutSolid S = start;
+    const Start kind = k % 2 == 0 ? Start::boxCorners : Start::extremes;
+    try {
+      placeCorners(B, k < 2 ? coordinateFrame(D) : principalFrame(D), kind, S);
+      if (!tried.insert(S.node).second) continue;
+      tryPaths(B, C, std::move(S),
+               std::string(kind == Start::extremes ? "extreme vertices" : "box corners") +
+                   (k < 2 ? "" : " along principal axes"),
+               best);
+    } catch (const MethodError& e) {
+      fault = e.what();
+      best.Pi.notes.push_back(fault);
+    }
+  }
+  if (best.mean < 0) throw MethodError(fault);
+  return best.Pi;
+}
+
+BoundaryPoint boundaryPoint(const BoundaryMapping& Pi, Vec3 xi) {
+  for (std::size_t c = 0; c < Pi.corners.size(); ++c)
+    if (latticeVector(Pi.cornersAt[c]) == xi)
+      return {0, static_cast<int>(c) + 1, {}, Pi.corners[c].x};
+  for (std::size_t c = 0; c < Pi.curves.size(); ++c) {
+    const Vec3 from = latticeVector(Pi.segments[c].from), to = latticeVector(Pi.segments[c].to);
+    const Vec3 along = to - from;
+    const double part = dot(xi - from, along) / norm2(along);
+    if (part < 0 || part > 1 || norm2(cross(xi - from, along)) > 0) continue;
+    // s by the sides' u, which runs along the segment
+    const Curve& C = Pi.curves[c];
+    const BoundaryMapping::Rectangle& R = Pi.rectangles[-C.sides[0].surface - 1];
+    const Vec2 u = inRectangle(R, xi), u0 = C.sides[0].u.front(), d = C.sides[0].u.back() - u0;
+    auto partAt = [&](std::size_t k) { return dot(C.sides[0].u[k] - u0, d) / dot(d, d); };
+    const double wanted = dot(u - u0, d) / dot(d, d);
+    std::size_t k = 0;
+    while (k + 2 < C.points.size() && partAt(k + 1) <= wanted) ++k;
+    const double t = (wanted - partAt(k)) / (partAt(k + 1) - partAt(k));
+    const double s = C.s[k] + t * (C.s[k + 1] - C.s[k]);
+    return {1, static_cast<int>(c) + 1, {s, 0}, gamma(C, s)};
+  }
+  for (std::size_t p = 0; p < Pi.patches.size(); ++p) {
+    const BoundaryMapping::Rectangle& R = Pi.rectangles[p];
+    if (component(xi, R.axis) != R.lo[R.axis]) continue;
+    const Vec2 u = inRectangle(R, xi);
+    if (std::min(u.x, u.y) < 0 || std::max(u.x, u.y) > 1) continue;
+    const Location at = locate(Pi.patches[p], u);
+    if (at.triangle >= 0) return {2, -static_cast<int>(p) - 1, u, varphi(Pi.patches[p], at)};
+  }
+  throw MethodError("boundaryPoint (§2): " + placeText(xi) +
+                    " does not lie on the meccano's boundary");
+}
+
+Mesh getInitialMesh(const Meccano& C, const BoundaryMapping& Pi) {
+  const std::set<LatticePoint> present(C.cubes.begin(), C.cubes.end());
+  std::vector<LatticePoint> cubes(present.begin(), present.end()), nodes;
+  std::sort(cubes.begin(), cubes.end(), precedes);
+  std::map<LatticePoint, int> cubesAt, nodeAt;
+  LatticePoint lo = cubes.at(0);
+  for (const LatticePoint& c : cubes) {
+    for (int a = 0; a < 3; ++a) lo[a] = std::min(lo[a], c[a]);
+    for (int i = 0; i < 8; ++i) ++cubesAt[{c[0] + (i & 1), c[1] + (i >> 1 & 1), c[2] + (i >> 2)}];
+  }
+  for (const auto& [p, count] : cubesAt) nodes.push_back(p);
+  std::sort(nodes.begin(), nodes.end(), precedes);
+  Mesh M;
+  M.patches = Pi.patches;
+  M.curves = Pi.curves;
+  M.corners = Pi.corners;
+  M.cube = C.cube;
+  Vec3 centre;
+  for (const Corner& corner : Pi.corners) centre += (1. / static_cast<double>(Pi.corners.size())) * corner.x;
+  for (const LatticePoint& p : nodes) {
+    nodeAt[p] = static_cast<int>(M.x.size());
+    const bool inside = cubesAt[p] == 8;
+    const BoundaryPoint at =
+        inside ? BoundaryPoint{3, 0, {}, centre} : boundaryPoint(Pi, latticeVector(p));
+    M.x.push_back(at.x);
+    M.xi.push_back(latticeVector(p) - latticeVector(lo));
+    M.dimension.push_back(static_cast<unsigned char>(at.dimension));
+    M.entity.push_back(at.entity);
+    M.parameter.push_back(at.parameter);
+  }
+  auto label = [&](const LatticePoint& c, int axis, int side) {  // of a cube's face
+    if (present.count(moved(c, axis, side ? 1 : -1)) > 0) return 0;
+    Vec3 middle = latticeVector(c) + Vec3{.5, .5, .5};
+    (axis == 0 ? middle.x : axis == 1 ? middle.y : middle.z) += side - .5;
+    return boundaryPoint(Pi, middle).entity;
+  };
+  for (const LatticePoint& c : cubes)
+    addKuhnCell(
+        M, c, [&](const LatticePoint& p) { return nodeAt.at(p); },
+        [&](int axis, int side) { return label(c, axis, side); });
+  M.type.assign(M.tets.size(), 0);
+  M.level.assign(M.tets.size(), 0);
+  placeInterior(M);
+  return M;
+}
+
+void placeInterior(Mesh& M) {
+  const std::size_t nodes = M.x.size();
+  std::vector<char> isInner(nodes);
+  for (std::size_t n = 0; n < nodes; ++n) isInner[n] = M.dimension[n] == 3;
+  // Stiffness of linear elements: ∫ ∇λ_i · ∇λ_j, without the diagonal (rows sum to 0).
+  struct Element {
+    std::array<int, 4> z;
+    double k[4][4];
+  };
+  std::vector<Element> elements;
+  std::vector<double> diagonal(nodes, 0.0);
+  for (const std::array<int, 4>& z : M.tets) {
+    if (!(isInner[z[0]] || isInner[z[1]] || isInner[z[2]] || isInner[z[3]])) continue;
+    Element E{z, {}};
+    const Mat3 edges{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]};
+    const Mat3 cof = cofactor(edges);
+    const Vec3 g[4] = {-(cof.c0 + cof.c1 + cof.c2), cof.c0, cof.c1, cof.c2};
+    for (int i = 0; i < 4; ++i)
+      for (int j = 0; j < 4; ++j)
+        if (i != j) {
+          E.k[i][j] = dot(g[i], g[j]) / (6 * std::abs(det(edges)));
+          diagonal[z[i]] -= E.k[i][j];
+        }
+    elements.push_back(E);
+  }
+  using Field = std::vector<Vec3>;
+  auto product = [&](const Field& p) {
+    Field y(nodes);
+    for (const Element& E : elements)
+      for (int i = 0; i < 4; ++i)
+        for (int j = 0; j < 4; ++j)
+          if (i != j) y[E.z[i]] += E.k[i][j] * (p[E.z[j]] - p[E.z[i]]);
+    for (std::size_t n = 0; n < nodes; ++n)
+      if (!isInner[n]) y[n] = {};
+    return y;
+  };
+  auto inner = [&](const Field& a, const Field& b) {
+    double sum = 0;
+    for (std::size_t n = 0; n < nodes; ++n) sum += dot(a[n], b[n]);
+    return sum;
+  };
+  auto scaled = [&](Field r) {  // by the diagonal
+    for (std::size_t n = 0; n < nodes; ++n)
+      if (isInner[n]) r[n] = (1 / diagonal[n]) * r[n];
+    return r;
+  };
+  // Conjugate gradients for the three coordinates at once.
+  constexpr double tolerance = 1e-10;  // of the first residual's norm: far below any element
+  constexpr int maxIterations = 5000;
+  Field r = product(M.x);
+  for (Vec3& v : r) v = -v;
+  Field z = scaled(r), p = z;
+  double rz = inner(r, z);
+  const double goal = tolerance * tolerance * rz;
+  for (int iteration = 0; rz > goal; ++iteration) {
+    if (iteration == maxIterations)
+      throw SolverError("placeInterior (§2): conjugate gradients did not reach " +
+                        number(tolerance) + " in " + std::to_string(maxIterations) +
+                        " iterations; the mesh's computational elements are degenerate");
+    const Field Ap = product(p);
+    const double alpha = rz / inner(p, Ap);
+    for (std::size_t n = 0; n < nodes; ++n) M.x[n] += alpha * p[n], r[n] += -alpha * Ap[n];
+    z = scaled(r);
+    const double next = inner(r, z), beta = next / rz;
+    for (std::size_t n = 0; n < nodes; ++n) p[n] = z[n] + beta * p[n];
+    rz = next;
+  }
 }
 
 // ==== 2. Kossaczký bisection [17] ================================================================
@@ -1499,16 +3029,6 @@ namespace {
 /// 1e-16 of their size, so a smaller height says nothing.
 constexpr double zeroHeight = 1e-14;
 
-std::string placeText(Vec3 p) {
-  char text[96];
-  std::snprintf(text, sizeof text, "(%.9g, %.9g, %.9g)", p.x, p.y, p.z);
-  return text;
-}
-
-std::string counted(std::size_t n, const std::string& one) {
-  return std::to_string(n) + ' ' + one + (n == 1 ? "" : "s");
-}
-
 [[noreturn]] void refuseSurface(const std::string& what) {
   throw InputError("insertSurface (§3.1): " + what);
 }
@@ -1579,26 +3099,6 @@ CleanSurface weldAndDrop(const TriangleSurface& S, std::vector<std::string>& war
                        counted(flat, "zero-area triangle") + " and " +
                        counted(unused, "unused point"));
   return C;
-}
-
-/// Disjoint sets of 0 .. n - 1, each named after its lowest member.
-struct Parts {
-  std::vector<int> parent;
-  explicit Parts(std::size_t n) : parent(n) { std::iota(parent.begin(), parent.end(), 0); }
-  int of(int i) {
-    while (parent[i] != i) i = parent[i] = parent[parent[i]];
-    return i;
-  }
-  void join(int i, int j) {
-    i = of(i);
-    j = of(j);
-    parent[std::max(i, j)] = std::min(i, j);
-  }
-};
-
-/// Corner of a triangle at point n: 0, 1, 2.
-int cornerAt(const std::array<int, 3>& triangle, int n) {
-  return static_cast<int>(std::find(triangle.begin(), triangle.end(), n) - triangle.begin());
 }
 
 /// Refuses points where two fans of triangles meet only there. Corners 3 t + i of triangles that
@@ -1750,6 +3250,75 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
                        " to give the surface a single orientation");
   checkDisk(C.S);
   return C.S;
+}
+
+namespace {
+
+/// Refuses open edges, several components and surfaces that cannot be oriented; orients the rest
+/// outward.
+void checkClosed(CleanSurface& C, std::vector<std::string>& warnings) {
+  TriangleSurface& S = C.S;
+  const std::vector<std::array<int, 3>> neighbours = triangleNeighbours(S, C.origin);
+  for (std::size_t t = 0; t < neighbours.size(); ++t)
+    for (int i = 0; i < 3; ++i)
+      if (neighbours[t][i] < 0)
+        refuseSurface("the surface is open: only triangle " + std::to_string(C.origin[t]) +
+                      " has the edge from " + placeText(S.points[S.triangles[t][i]]) + " to " +
+                      placeText(S.points[S.triangles[t][(i + 1) % 3]]) + "; close it");
+  checkFans(C, neighbours);
+  const std::vector<int> sizes = componentSizes(neighbours);
+  if (sizes.size() > 1)
+    refuseSurface("the surface has " + std::to_string(sizes.size()) +
+                  " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
+                  std::to_string(sizes.back()) + " triangles); mesh them one by one");
+  const int turned = orientConsistently(S, neighbours);
+  if (turned < 0) refuseSurface("the surface is not orientable; it bounds no solid");
+  if (turned > 0)
+    warnings.push_back("§2: turned " + counted(turned, "triangle") +
+                       " to give the surface a single orientation");
+  double volume = 0, area = 0;
+  for (const std::array<int, 3>& t : S.triangles) {
+    const Vec3 a = S.points[t[0]] - S.points[0], b = S.points[t[1]] - S.points[0],
+               c = S.points[t[2]] - S.points[0];
+    volume += dot(a, cross(b, c)) / 6;
+    area += norm(cross(b - a, c - a)) / 2;
+  }
+  constexpr double thinnest = 1e-10;  // volume over area^1.5: rounding below
+  if (std::abs(volume) <= thinnest * area * std::sqrt(area))
+    refuseSurface("the surface encloses no volume; check its coordinates");
+  if (volume > 0) return;
+  for (std::array<int, 3>& t : S.triangles) std::swap(t[1], t[2]);
+}
+
+/// Triangles without a common point that cross, and the place of the first.
+int crossingTriangles(const TriangleSurface& S, Vec3& where);
+
+}  // namespace
+
+TriangleSurface checkSolid(const TriangleSurface& D, std::vector<std::string>& warnings) {
+  try {
+    checkNumbers(D);
+    CleanSurface C = weldAndDrop(D, warnings);
+    if (C.S.triangles.empty())
+      refuseSurface(D.triangles.empty() ? "the surface is empty; give the triangles of a solid"
+                                        : "the surface is empty: all its triangles have zero area; "
+                                          "check its coordinates");
+    checkClosed(C, warnings);
+    Vec3 where;
+    if (const int pairs = crossingTriangles(C.S, where); pairs > 0)
+      warnings.push_back("§2: the surface crosses itself: " + counted(pairs, "pair") +
+                         " of triangles, the first at " + placeText(where) +
+                         "; the mesh may overlap there");
+    return C.S;
+  } catch (const InputError& e) {  // the tools of §3.1 speak of an insertion
+    const std::string text = e.what(), prefix = "insertSurface (§3.1): ";
+    throw InputError("checkSolid (§2): " +
+                     (text.rfind(prefix, 0) == 0 ? text.substr(prefix.size()) : text));
+  }
+}
+
+int genusOf(const TriangleSurface& D) {
+  return (2 - static_cast<int>(D.points.size()) + static_cast<int>(D.triangles.size()) / 2) / 2;
 }
 
 // ==== Tools for 3.2 and 3.4: distance to S ======================================================
@@ -2010,6 +3579,30 @@ double sampledDistance(const TriangleTree& A, const TriangleTree& B, int m) {
         largest = std::max(largest, B.closest(p).distance);
       }
   return largest;
+}
+
+int crossingTriangles(const TriangleSurface& S, Vec3& where) {
+  const TriangleTree tree(S.points, S.triangles);
+  int pairs = 0;
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
+    const std::array<int, 3>& v = S.triangles[t];
+    const std::array<Vec3, 3> A{S.points[v[0]], S.points[v[1]], S.points[v[2]]};
+    const TriangleTree::Box box = boxOf(A);
+    tree.visit(box.lo, box.hi, [&](int o) {
+      const std::array<int, 3>& w = S.triangles[o];
+      if (o <= t || std::find_first_of(v.begin(), v.end(), w.begin(), w.end()) != v.end())
+        return false;
+      const std::array<Vec3, 3> B{S.points[w[0]], S.points[w[1]], S.points[w[2]]};
+      bool cross = false;
+      Vec3 at;
+      for (int i = 0; i < 3 && !cross; ++i)
+        cross = segmentCrosses(A[i], A[(i + 1) % 3], B, at) ||
+                segmentCrosses(B[i], B[(i + 1) % 3], A, at);
+      if (cross && pairs++ == 0) where = at;
+      return false;
+    });
+  }
+  return pairs;
 }
 
 }  // namespace
