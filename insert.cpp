@@ -2258,8 +2258,6 @@ void bisect(Mesh& M, const std::vector<int>& E) {
 
 namespace {
 
-std::string placeText(Vec3 p);
-
 void checkTerrain(const Terrain& T) {
   const auto refuse = [](const std::string& what) {
     throw InputError("meccanoMesher (§2): " + what);
@@ -2690,70 +2688,6 @@ void projectNewNodesToBoundary(Mesh& M, const TriangleList& tauNew) {
 
 namespace {
 
-/// 6 |E| ∇λ_i·∇λ_j of the computational tetrahedra: what a harmonic interior needs.
-using Stiffness = std::array<double, 6>;
-constexpr int edgeEnds[6][2] = {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}};
-
-Stiffness stiffnessOf(const Mesh& M, const std::array<int, 4>& z) {
-  const Vec3 a = M.xi[z[1]] - M.xi[z[0]], b = M.xi[z[2]] - M.xi[z[0]], c = M.xi[z[3]] - M.xi[z[0]];
-  const Mat3 C = cofactor({a, b, c});  // columns: det times the gradients of λ_1, λ_2, λ_3
-  const std::array<Vec3, 4> g{-(C.c0 + C.c1 + C.c2), C.c0, C.c1, C.c2};
-  const double volume = std::abs(det({a, b, c}));
-  Stiffness k;
-  for (int e = 0; e < 6; ++e) k[e] = dot(g[edgeEnds[e][0]], g[edgeEnds[e][1]]) / volume;
-  return k;
-}
-
-/// y = K x at the inner nodes: K has the rows Σ_j k_ij (x_j − x_i).
-void applyStiffness(const Mesh& M, const std::vector<Stiffness>& K, const std::vector<Vec3>& x,
-                    std::vector<Vec3>& y) {
-  y.assign(x.size(), {});
-  for (std::size_t E = 0; E < K.size(); ++E)
-    for (int e = 0; e < 6; ++e) {
-      const int a = M.tets[E][edgeEnds[e][0]], b = M.tets[E][edgeEnds[e][1]];
-      const Vec3 flow = K[E][e] * (x[b] - x[a]);
-      y[a] += flow;
-      y[b] += -flow;
-    }
-  for (std::size_t n = 0; n < x.size(); ++n)
-    if (M.dimension[n] < 3) y[n] = {};
-}
-
-/// [choice] The inner nodes at the harmonic map of ξ with the values of Π on ∂M: linear finite
-/// elements, conjugate gradients with the diagonal. Fewer elements are inverted than with the
-/// midpoints of the bisection.
-void harmonicInterior(Mesh& M) {
-  constexpr double tolerance = 1e-6;  // of the first residual: the optimization moves them anyway
-  constexpr int maxIterations = 2000;
-  std::vector<Stiffness> K;
-  for (const std::array<int, 4>& z : M.tets) K.push_back(stiffnessOf(M, z));
-  std::vector<double> diagonal(M.x.size(), 0);
-  for (std::size_t E = 0; E < K.size(); ++E)
-    for (int e = 0; e < 6; ++e)
-      for (int end : edgeEnds[e]) diagonal[M.tets[E][end]] -= K[E][e];
-  auto product = [](const std::vector<Vec3>& a, const std::vector<Vec3>& b) {
-    double sum = 0;
-    for (std::size_t n = 0; n < a.size(); ++n) sum += dot(a[n], b[n]);
-    return sum;
-  };
-  std::vector<Vec3> r, z(M.x.size()), p(M.x.size()), Kp;
-  applyStiffness(M, K, M.x, r);
-  double rz = 0, first = 0;
-  for (int k = 0; k < maxIterations; ++k) {
-    for (std::size_t n = 0; n < r.size(); ++n) z[n] = (1 / diagonal[n]) * r[n];
-    const double last = std::exchange(rz, product(r, z));
-    if (k == 0) first = rz;
-    if (!(rz > tolerance * tolerance * first)) return;
-    for (std::size_t n = 0; n < p.size(); ++n) p[n] = z[n] + (k > 0 ? rz / last : 0) * p[n];
-    applyStiffness(M, K, p, Kp);
-    const double step = -rz / product(p, Kp);
-    for (std::size_t n = 0; n < p.size(); ++n) {
-      M.x[n] += step * p[n];
-      r[n] += step * Kp[n];
-    }
-  }
-}
-
 /// Nodes on the boundary.
 std::vector<int> boundaryNodes(const Mesh& M) {
   std::vector<char> on(M.x.size(), 0);
@@ -2922,7 +2856,7 @@ OptimizeReport slideWithin(Mesher& W, double eps) {
 void optimizeQuality(Mesher& W) {
   constexpr int maxRounds = 6;
   const double eps = sampledEps * W.options.eps;
-  harmonicInterior(W.M);
+  placeInterior(W.M);
   for (int k = 0; k < maxRounds; ++k) {
     Bisection B(W.M);
     if (splitFlatCorners(B) == 0) break;
@@ -3000,6 +2934,25 @@ MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
   report.regular = qualityStatistics(work, Ideal::regular);
   for (unsigned char level : work.level) report.depth = std::max<int>(report.depth, level);
   W.stage("smoothed");
+  M = std::move(work);
+  return report;
+}
+
+MesherReport meccanoMesher(Mesh& M, const TriangleSurface& Omega, const MesherOptions& options) {
+  checkOptions(options);
+  std::vector<std::string> warnings;
+  const TriangleSurface solid = checkSolid(Omega, warnings);
+  const Meccano D = options.meccano.cubes.empty() ? getMeccano(solid) : options.meccano;
+  const BoundaryMapping Pi = getBoundaryMapping(D, solid);
+  if (options.onProgress) {
+    options.onProgress("meccano: " + counted(D.cubes.size(), "cube") + ", " +
+                       counted(Pi.patches.size(), "patch") + ", " +
+                       counted(Pi.curves.size(), "patch edge"));
+    for (const std::string& note : Pi.notes) options.onProgress(note);
+  }
+  Mesh work = getInitialMesh(D, Pi);
+  MesherReport report = meccanoMesher(work, options);
+  report.warnings.insert(report.warnings.begin(), warnings.begin(), warnings.end());
   M = std::move(work);
   return report;
 }

@@ -4,8 +4,9 @@
 //   Files            reading whole files, writing beside the target and renaming
 //   Wavefront OBJ    surfaces in
 //   ESRI ASCII grids terrain in
+//   Polycubes        meccanos in
 //   VTK legacy       meshes out and in, with all that a later insertion needs
-//   Commands         box, terrain, insert, optimize, stats
+//   Commands         box, terrain, solid, insert, optimize, stats
 //   Arguments        options, help, exit status: 0 done and valid, 1 an error, 2 wrong usage
 #include <unistd.h>
 
@@ -454,6 +455,46 @@ Terrain parseAsc(const std::string& name, const std::string& text) {
 }
 
 Terrain readTerrain(const std::string& path) { return parseAsc(path, readFile(path)); }
+
+// ==== Polycubes =================================================================================
+
+/// `cube i j k` lines, and `corner i j k  x y z` where a corner of the meccano goes; # comments.
+Meccano parsePolycube(const std::string& name, const std::string& text) {
+  constexpr int farthest = 100000;
+  Meccano D;
+  Scanner lines(name, text);
+  std::vector<std::string_view> words;
+  while (!lines.consumed()) {
+    splitWords(lines.line(), words);
+    if (words.empty()) continue;
+    const bool corner = words[0] == "corner";
+    if (!corner && words[0] != "cube")
+      lines.failHere("'" + std::string(words[0].substr(0, 40)) +
+                     "' is no line of a polycube; they are `cube i j k` and `corner i j k  x y z`");
+    if (words.size() != (corner ? 7u : 4u))
+      lines.failHere(std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
+                     ", here are " + std::to_string(words.size() - 1) + " numbers");
+    std::array<int, 3> at;
+    for (int i = 0; i < 3; ++i)
+      if (!parse(words[i + 1], at[i]) || std::abs(at[i]) > farthest)
+        lines.failHere("'" + std::string(words[i + 1].substr(0, 40)) +
+                       "' is no integer of the lattice; correct it");
+    if (!corner) {
+      if (std::find(D.cubes.begin(), D.cubes.end(), at) != D.cubes.end())
+        lines.failHere("this cube is given twice; keep one line");
+      D.cubes.push_back(at);
+      continue;
+    }
+    double x[3];
+    for (int i = 0; i < 3; ++i)
+      if (!parse(words[i + 4], x[i]) || !std::isfinite(x[i]))
+        lines.failHere("'" + std::string(words[i + 4].substr(0, 40)) +
+                       "' is no coordinate; correct it");
+    D.corners.push_back({at, {x[0], x[1], x[2]}});
+  }
+  if (D.cubes.empty()) lines.failAsWhole("no `cube i j k` line in it; is it a polycube?");
+  return D;
+}
 
 // ==== VTK legacy: the arrays ====================================================================
 
@@ -1361,6 +1402,25 @@ void runTerrain(const Arguments& a, const Streams& io) {
   finishMesher(path, M, report, progress, io);
 }
 
+void runSolid(const Arguments& a, const Streams& io) {
+  const std::string path = a.output();
+  if (!a.has("--eps")) throw UsageError("the precision is missing: --eps E");
+  Progress progress(io, a.has("--quiet"));
+  MesherOptions options = mesherOptions(a, progress);
+  if (!(options.eps > 0)) throw UsageError("--eps must be above 0");
+  checkWritable(path);
+  const TriangleSurface S = readSurface(a.operands[0]);
+  if (a.has("--polycube")) {
+    const std::string& file = a.options.at("--polycube")[0];
+    options.meccano = parsePolycube(file, readFile(file));
+  }
+  progress.line("solid " + a.operands[0] + ": " + std::to_string(S.points.size()) + " points, " +
+                std::to_string(S.triangles.size()) + " triangles");
+  Mesh M;
+  const MesherReport report = meccanoMesher(M, S, options);
+  finishMesher(path, M, report, progress, io);
+}
+
 /// What insertion needs of a mesh that was read.
 void checkInsertable(const std::string& path, const Mesh& M) {
   if (M.xi.empty())
@@ -1553,6 +1613,22 @@ const std::vector<Command>& commands() {
         maxTetsOption,
         quietOption},
        runTerrain},
+      {"solid",
+       "SURFACE.obj",
+       "Makes the tetrahedral mesh of the solid inside a closed surface by Algorithm 1, and prints\n"
+       "its quality. Without a polycube the meccano is a box of cubes, for solids without handles.\n"
+       "A polycube file has a line `cube i j k` for each cube, and `corner i j k  x y z` for each\n"
+       "corner of their union: the point of the solid where it goes.",
+       1,
+       1,
+       {outputOption,
+        {"--eps", "E", "largest distance from the surface, in the unit of the input"},
+        {"--polycube", "FILE", "the meccano and where its corners go"},
+        {"--fixed-boundary", "", "boundary nodes stay where the boundary mapping puts them"},
+        powerOption,
+        maxTetsOption,
+        quietOption},
+       runSolid},
       {"insert",
        "MESH.vtk SURFACE.obj",
        "Inserts a triangulated surface into a mesh that meccano wrote, and prints Table I: the\n"

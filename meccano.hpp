@@ -426,6 +426,7 @@ double terrainEps(const Terrain& T);
 
 struct MesherOptions {
   double eps = 0;              // [Algorithm 1] ε, length unit of the input; > 0
+  Meccano meccano = {};        // D; without cubes: getMeccano's
   bool fixedBoundary = false;  // boundary nodes stay where Π put them
   int maxTets = 20000000;      // refuse where more tetrahedra are predicted
   OptimizeOptions optimize;    // §3.7; its fixed, active, accept and starDelta are the mesher's
@@ -476,6 +477,10 @@ void projectNewNodesToBoundary(Mesh& M, const TriangleList& tauNew);
 ///   errors  MethodError where elements stay inverted
 void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& report);
 
+/// [§2, Algorithm 1] MeccanoMesher: the solid inside the closed surface Omega, within eps.
+///   errors  InputError: the solid, the meccano or the options; MethodError, SolverError. M is
+///           unchanged when it throws.
+MesherReport meccanoMesher(Mesh& M, const TriangleSurface& Omega, const MesherOptions& options);
 /// [§2, Algorithm 1] The box below `top`, its bottom within eps of the bilinear terrain, its sides
 /// in their planes.
 ///   errors  InputError: the terrain or the options; MethodError. M is unchanged when it throws.
