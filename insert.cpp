@@ -2254,6 +2254,726 @@ void bisect(Mesh& M, const std::vector<int>& E) {
     if (M.level[E[i]] == level[i]) B.bisect(E[i]);
 }
 
+// ==== 2. Terrain =================================================================================
+
+namespace {
+
+void checkTerrain(const Terrain& T) {
+  const auto refuse = [](const std::string& what) {
+    throw InputError("meccanoMesher (§2): " + what);
+  };
+  if (T.nx < 2 || T.ny < 2 || T.z.size() != std::size_t(T.nx) * T.ny)
+    refuse("a terrain needs 2 x 2 grid points or more, and a height for each; given are " +
+           std::to_string(T.nx) + " x " + std::to_string(T.ny) + " points, " +
+           std::to_string(T.z.size()) + " heights");
+  if (!(T.cell > 0) || !std::isfinite(T.cell)) refuse("the terrain's cell must be above 0");
+  for (std::size_t k = 0; k < T.z.size(); ++k) {
+    const std::string where = " at grid point (" + std::to_string(k % T.nx) + ", " +
+                              std::to_string(k / T.nx) + ")";
+    if (!std::isfinite(T.z[k])) refuse("the height" + where + " is not finite");
+    if (!(T.z[k] < T.top))
+      refuse("the height " + number(T.z[k]) + where + " is not below the top " + number(T.top) +
+             "; raise the top");
+  }
+}
+
+double meanHeight(const Terrain& T) {
+  return std::accumulate(T.z.begin(), T.z.end(), 0.) / static_cast<double>(T.z.size());
+}
+
+/// The bilinear surface is straight along grid lines; inside a cell two triangles miss it by a
+/// quarter of this.
+double twist(const Terrain& T, int i, int j) {
+  const double* z = &T.z[j * T.nx + i];
+  return z[0] - z[1] - z[T.nx] + z[T.nx + 1];
+}
+
+constexpr double bilinearPart = .1;  // [choice] of ε is left to the triangles of the patch
+constexpr int mostPieces = 8;        // of a grid cell along each axis
+
+/// k x k pieces of a grid cell leave twist / (4 k²).
+int piecesOf(const Terrain& T, int i, int j, double allowed) {
+  const double k = std::sqrt(std::abs(twist(T, i, j)) / (4 * allowed));
+  return std::clamp(static_cast<int>(std::ceil(k)), 1, mostPieces);
+}
+
+/// The bottom patch: ϕ(u) has its x and y affine in u, its z on the bilinear terrain at the points.
+/// [choice] A cell is cut into as many pieces as leave `allowed`; its neighbours need not match,
+/// since the terrain is straight between them.
+Parametrization terrainPatch(const Terrain& T, double allowed) {
+  Parametrization P;
+  P.name = "terrain";
+  KeyMap known(T.z.size());  // by position on the grid, in pieces of all sizes; number + 1
+  constexpr int common = 840;  // divisible by 1 .. 8
+  auto point = [&](int i, int j, int a, int b, int k) {
+    const std::uint64_t x = std::uint64_t(i) * common + a * common / k;
+    const std::uint64_t y = std::uint64_t(j) * common + b * common / k;
+    int& n = known[x << 32 | y];
+    if (n == 0) {
+      const double s = i + double(a) / k, t = j + double(b) / k;
+      const double px = T.origin.x + T.cell * s, py = T.origin.y + T.cell * t;
+      P.points.push_back({px, py, heightAt(T, px, py)});
+      P.u.push_back({s / (T.nx - 1), t / (T.ny - 1)});
+      n = static_cast<int>(P.points.size());
+    }
+    return n - 1;
+  };
+  for (int j = 0; j + 1 < T.ny; ++j)
+    for (int i = 0; i + 1 < T.nx; ++i) {
+      const int k = piecesOf(T, i, j, allowed);
+      for (int b = 0; b < k; ++b)
+        for (int a = 0; a < k; ++a) {
+          const int p = point(i, j, a, b, k), q = point(i, j, a + 1, b, k);
+          const int r = point(i, j, a + 1, b + 1, k), s = point(i, j, a, b + 1, k);
+          P.triangles.push_back({p, q, r});
+          P.triangles.push_back({p, r, s});
+        }
+    }
+  buildLocator(P);
+  return P;
+}
+
+/// The largest distance, measured upright, of that patch from the bilinear terrain.
+double terrainDeviation(const Terrain& T, double allowed) {
+  double most = 0;
+  for (int j = 0; j + 1 < T.ny; ++j)
+    for (int i = 0; i + 1 < T.nx; ++i) {
+      const int k = piecesOf(T, i, j, allowed);
+      most = std::max(most, std::abs(twist(T, i, j)) / (4. * k * k));
+    }
+  return most;
+}
+
+/// The curve through points, with u on both patches beside it.
+Curve openCurve(const std::vector<Vec3>& points, std::vector<Curve::Side> sides) {
+  Curve C;
+  C.points = points;
+  C.s.push_back(0);
+  for (std::size_t i = 1; i < points.size(); ++i)
+    C.s.push_back(C.s.back() + norm(points[i] - points[i - 1]));
+  C.sides = std::move(sides);
+  return C;
+}
+
+/// The box over the terrain, low and size its extent.
+struct TerrainBox {
+  const Terrain& T;
+  Vec3 low, size;
+
+  /// u of a point on the box side normal to `axis`.
+  Vec2 onSide(int axis, Vec3 x) const {
+    auto part = [&](int a) { return (component(x, a) - component(low, a)) / component(size, a); };
+    return {part((axis + 1) % 3), part((axis + 2) % 3)};
+  }
+  Vec3 ground(double x, double y) const { return {x, y, heightAt(T, x, y)}; }
+};
+
+TerrainBox terrainBox(const Terrain& T) {
+  const double zLow = *std::min_element(T.z.begin(), T.z.end());
+  return {T,
+          {T.origin.x, T.origin.y, zLow},
+          {T.cell * (T.nx - 1), T.cell * (T.ny - 1), T.top - zLow}};
+}
+
+/// A bottom edge or an upright edge of the box, on the ground.
+Curve groundCurve(const TerrainBox& B, int axis, int b, int c) {
+  const Vec3 far = B.low + B.size;
+  std::vector<Vec3> points;
+  const int first = (axis + 1) % 3, second = (axis + 2) % 3;
+  std::array<int, 3> side{0, 0, 0};
+  side[first] = b, side[second] = c;
+  const double x = side[0] ? far.x : B.low.x, y = side[1] ? far.y : B.low.y;
+  if (axis == 0)
+    for (int i = 0; i < B.T.nx; ++i) points.push_back(B.ground(B.low.x + B.T.cell * i, y));
+  if (axis == 1)
+    for (int j = 0; j < B.T.ny; ++j) points.push_back(B.ground(x, B.low.y + B.T.cell * j));
+  if (axis == 2) points = {B.ground(x, y), {x, y, far.z}};
+  std::vector<Curve::Side> sides{{-boxPatch(first, b), {}}, {-boxPatch(second, c), {}}};
+  for (Vec3 p : points) {
+    sides[0].u.push_back(B.onSide(first, p));
+    sides[1].u.push_back(B.onSide(second, p));
+  }
+  return openCurve(points, sides);
+}
+
+/// s of a curve where its coordinate along the axis is x.
+double arcLengthAt(const Curve& C, int axis, double x) {
+  std::size_t i = 1;
+  while (i + 1 < C.points.size() && component(C.points[i], axis) < x) ++i;
+  const double a = component(C.points[i - 1], axis), b = component(C.points[i], axis);
+  return C.s[i - 1] + (x - a) / (b - a) * (C.s[i] - C.s[i - 1]);
+}
+
+/// Moves a node of the box upright to its place between terrain and top, and gives it its
+/// parameter there.
+void raiseNode(Mesh& M, const TerrainBox& B, int n) {
+  Vec3& x = M.x[n];
+  const double ground = heightAt(B.T, x.x, x.y), part = (x.z - B.low.z) / B.size.z;
+  if (part < 1) x.z = ground + part * (B.T.top - ground);
+  const int entity = M.entity[n];
+  if (M.dimension[n] == 0) x = M.corners[entity - 1].x;
+  if (M.dimension[n] == 1) {
+    const int axis = (entity - 1) / 4;
+    M.parameter[n].x = arcLengthAt(M.curves[entity - 1], axis, component(x, axis));
+    x = gamma(M.curves[entity - 1], M.parameter[n].x);
+  }
+  if (M.dimension[n] == 2) {
+    M.parameter[n] = B.onSide((-entity - 1) / 2, x);
+    x = varphi(M.patches[-entity - 1], M.parameter[n]);
+  }
+}
+
+/// [§2, Algorithm 1, lines 2 to 4] The initial mesh: near-cubic cells, its columns between terrain
+/// and top; Π is the box's, its bottom on the terrain. [choice] The upright sides are whole
+/// rectangles, down to the lowest ground: a midpoint of parameters is that of the points.
+Mesh terrainMesh(const Terrain& T, double allowed) {
+  const std::array<int, 3> cells = terrainCells(T);
+  const TerrainBox B = terrainBox(T);
+  Mesh M = boxMesh(B.low, B.size, cells);
+  M.patches[boxPatch(2, 0) - 1] = terrainPatch(T, allowed);
+  for (int c = 0; c < 2; ++c)
+    for (int b = 0; b < 2; ++b) {
+      if (b == 0) M.curves[boxCurve(0, c, 0) - 1] = groundCurve(B, 0, c, 0);
+      if (b == 0) M.curves[boxCurve(1, 0, c) - 1] = groundCurve(B, 1, 0, c);
+      M.curves[boxCurve(2, b, c) - 1] = groundCurve(B, 2, b, c);
+    }
+  for (Corner& corner : M.corners)
+    for (Corner::Place& place : corner.on) {
+      const Curve& C = M.curves[place.curve - 1];
+      place.s = place.s > 0 ? C.s.back() : 0;
+      corner.x = place.s > 0 ? C.points.back() : C.points.front();
+    }
+  for (int n = 0; n < static_cast<int>(M.x.size()); ++n) raiseNode(M, B, n);
+  M.cube.z = (T.top - meanHeight(T)) / cells[2];
+  return M;
+}
+
+}  // namespace
+
+double heightAt(const Terrain& T, double x, double y) {
+  const double s = std::clamp((x - T.origin.x) / T.cell, 0., T.nx - 1.);
+  const double t = std::clamp((y - T.origin.y) / T.cell, 0., T.ny - 1.);
+  const int i = std::min(static_cast<int>(s), T.nx - 2), j = std::min(static_cast<int>(t), T.ny - 2);
+  const double a = s - i, b = t - j;
+  const double* z = &T.z[j * T.nx + i];
+  return (1 - b) * ((1 - a) * z[0] + a * z[1]) + b * ((1 - a) * z[T.nx] + a * z[T.nx + 1]);
+}
+
+std::array<int, 3> terrainCells(const Terrain& T) {
+  constexpr double alongLonger = 8;  // [choice] cells, where the height allows
+  checkTerrain(T);
+  const Vec3 size{T.cell * (T.nx - 1), T.cell * (T.ny - 1), T.top - meanHeight(T)};
+  double h = std::min(std::max(size.x, size.y) / alongLonger, size.z);
+  h = size.z / std::round(size.z / h);
+  std::array<int, 3> cells = T.cells;
+  for (int a = 0; a < 3; ++a)
+    if (cells[a] == 0) cells[a] = std::max(1, static_cast<int>(std::lround(component(size, a) / h)));
+  return cells;
+}
+
+double terrainEps(const Terrain& T) {
+  constexpr double partOfDiagonal = .002;
+  checkTerrain(T);
+  return partOfDiagonal * norm(terrainBox(T).size);
+}
+
+// ==== 2. Algorithm 1: distance ===================================================================
+
+namespace {
+
+/// A triangle of ∂M with its nodes' parameters on its patch.
+struct BoundaryFace {
+  BoundaryTriangle at;
+  int label;
+  std::array<int, 3> n;
+  std::array<Vec2, 3> u;
+};
+
+BoundaryFace boundaryFace(const Mesh& M, BoundaryTriangle at) {
+  BoundaryFace face{at, M.faceLabel[at.E][at.i], {}, {}};
+  for (int j = 0; j < 3; ++j) {
+    face.n[j] = M.tets[at.E][(at.i + 1 + j) % 4];
+    if (!parameterOn(M, face.n[j], face.label, face.u[j]))
+      throw MethodError("distance (§2): node " + std::to_string(face.n[j]) +
+                        " does not lie on its boundary patch " + std::to_string(-face.label) +
+                        "; the mesh's entities are inconsistent");
+  }
+  if (cross(face.u[1] - face.u[0], face.u[2] - face.u[0]) < 0) {
+    std::swap(face.n[1], face.n[2]);
+    std::swap(face.u[1], face.u[2]);
+  }
+  return face;
+}
+
+/// Whether a patch is planar: relative to its extent, with room for the rounding of its points.
+bool isPlanar(const Parametrization& P) {
+  constexpr double tolerance = 1e-12;
+  Vec3 a = P.points[0], b = a, normal{};
+  for (Vec3 p : P.points)
+    if (norm2(p - a) > norm2(b - a)) b = p;
+  for (Vec3 p : P.points)
+    if (norm2(cross(b - a, p - a)) > norm2(normal)) normal = cross(b - a, p - a);
+  const double size = norm(normal) * norm(b - a);
+  for (Vec3 p : P.points)
+    if (std::abs(dot(normal, p - a)) > tolerance * size) return false;
+  return true;
+}
+
+/// ∂Ω: the curved patches, which must be approximated, and a tree over them.
+struct CurvedBoundary {
+  std::vector<char> curved;  // [patches]
+  TriangleTree tree;
+};
+
+CurvedBoundary curvedBoundary(const Mesh& M) {
+  CurvedBoundary B;
+  std::vector<Vec3> points;
+  std::vector<std::array<int, 3>> triangles;
+  for (const Parametrization& P : M.patches) {
+    B.curved.push_back(!isPlanar(P));
+    if (!B.curved.back()) continue;
+    const int first = static_cast<int>(points.size());
+    points.insert(points.end(), P.points.begin(), P.points.end());
+    for (const std::array<int, 3>& t : P.triangles)
+      triangles.push_back({t[0] + first, t[1] + first, t[2] + first});
+  }
+  B.tree = TriangleTree(points, triangles);
+  return B;
+}
+
+/// Calls sample(w0, w1, w2) on a lattice of the triangle without its vertices, until it is true.
+template <class Sample>
+bool anySample(int steps, Sample sample) {
+  for (int a = 0; a <= steps; ++a)
+    for (int b = 0; a + b <= steps; ++b) {
+      const int c = steps - a - b;
+      if (a == steps || b == steps || c == steps) continue;
+      if (sample(double(a) / steps, double(b) / steps, double(c) / steps)) return true;
+    }
+  return false;
+}
+
+/// A point of Π and the point of the flat face with the same barycentric coordinates.
+struct Sampled {
+  Vec3 onSolid, onFace;
+};
+Sampled sampled(const Parametrization& P, const std::array<Vec3, 3>& x,
+                const std::array<Vec2, 3>& u, double a, double b, double c) {
+  return {varphi(P, a * u[0] + b * u[1] + c * u[2]), a * x[0] + b * x[1] + c * x[2]};
+}
+
+std::array<Vec3, 3> placesOf(const Mesh& M, const std::array<int, 3>& n) {
+  return {M.x[n[0]], M.x[n[1]], M.x[n[2]]};
+}
+
+/// Both distances of a face at its sample points.
+struct FaceDistance {
+  double toSolid = 0, toFace = 0;
+};
+FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& Omega,
+                         double enough) {
+  constexpr int steps = 5;  // [choice] 18 points of each face
+  const std::array<Vec3, 3> x = placesOf(M, face.n);
+  const Parametrization& P = surfaceOf(M, face.label);
+  FaceDistance d;
+  anySample(steps, [&](double a, double b, double c) {
+    const Sampled at = sampled(P, x, face.u, a, b, c);
+    const double bound = norm(at.onSolid - at.onFace);
+    if (bound <= std::max(enough, std::min(d.toSolid, d.toFace))) {
+      d.toSolid = std::max(d.toSolid, bound), d.toFace = std::max(d.toFace, bound);
+      return false;
+    }
+    d.toSolid = std::max(d.toSolid, Omega.tree.closest(at.onFace, bound * (1 + 1e-9)).distance);
+    d.toFace = std::max(d.toFace,
+                        closestPointOnTriangle(at.onSolid, x[0], x[1], x[2]).distance);
+    return false;
+  });
+  return d;
+}
+
+/// The distance of each point of a patch from the face that holds its parameter.
+void measurePatch(const Mesh& M, const std::vector<BoundaryFace>& faces, int label, double enough,
+                  BoundaryDistance& result) {
+  const Parametrization& P = surfaceOf(M, label);
+  Parametrization flat;  // ∂M over the same 𝓤
+  std::vector<const BoundaryFace*> of;
+  for (const BoundaryFace& face : faces) {
+    if (face.label != label) continue;
+    const int first = static_cast<int>(flat.points.size());
+    for (int j = 0; j < 3; ++j) {
+      flat.points.push_back(M.x[face.n[j]]);
+      flat.u.push_back(face.u[j]);
+    }
+    flat.triangles.push_back({first, first + 1, first + 2});
+    of.push_back(&face);
+  }
+  buildLocator(flat);
+  for (std::size_t k = 0; k < P.points.size(); ++k) {
+    const Location at = locate(flat, P.u[k]);
+    if (at.triangle < 0) continue;  // on the border of 𝓤, within rounding: a neighbour has it
+    double d = norm(P.points[k] - varphi(flat, at));
+    const std::array<Vec3, 3> x = placesOf(M, of[at.triangle]->n);
+    if (d > enough) d = closestPointOnTriangle(P.points[k], x[0], x[1], x[2]).distance;
+    const BoundaryTriangle face = of[at.triangle]->at;
+    double& ofFace = result.ofFace[face.E][face.i];
+    ofFace = std::max(ofFace, d);
+    result.toMesh = std::max(result.toMesh, d);
+  }
+}
+
+/// distance(∂M, ∂Ω) with ∂Ω prepared.
+BoundaryDistance distanceTo(const Mesh& M, const CurvedBoundary& Omega, double enough) {
+  BoundaryDistance result;
+  result.ofFace.assign(M.tets.size(), {0, 0, 0, 0});
+  std::vector<BoundaryFace> faces;
+  for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (M.faceLabel[E][i] < 0 && Omega.curved[-M.faceLabel[E][i] - 1])
+        faces.push_back(boundaryFace(M, {E, i}));
+  for (const BoundaryFace& face : faces) {
+    const FaceDistance d = sampledFace(M, face, Omega, enough);
+    result.ofFace[face.at.E][face.at.i] = std::max(d.toSolid, d.toFace);
+    result.toSolid = std::max(result.toSolid, d.toSolid);
+    result.toMesh = std::max(result.toMesh, d.toFace);
+  }
+  for (std::size_t p = 0; p < M.patches.size(); ++p)
+    if (Omega.curved[p]) measurePatch(M, faces, -static_cast<int>(p) - 1, enough, result);
+  return result;
+}
+
+}  // namespace
+
+BoundaryDistance distance(const Mesh& M, double enough) {
+  checkMeccano(M, "distance (§2)");
+  return distanceTo(M, curvedBoundary(M), enough);
+}
+
+// ==== 2. Algorithm 1: refinement =================================================================
+
+TriangleList getTrianglesToRefine(const Mesh& M, const BoundaryDistance& d, double eps) {
+  TriangleList tau;
+  for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (d.ofFace[E][i] > eps) tau.push_back({E, i});
+  return tau;
+}
+
+TriangleList refineTriangles(Bisection& B, const TriangleList& tau) {
+  const int nodes = static_cast<int>(B.M.x.size());
+  std::vector<unsigned char> level;
+  for (const BoundaryTriangle& t : tau) level.push_back(B.M.level[t.E]);
+  for (std::size_t k = 0; k < tau.size(); ++k)
+    if (B.M.level[tau[k].E] == level[k]) B.bisect(tau[k].E);
+  TriangleList tauNew;
+  for (int E = 0; E < static_cast<int>(B.M.tets.size()); ++E)
+    for (int i = 0; i < 4; ++i) {
+      if (B.M.faceLabel[E][i] >= 0) continue;
+      bool isNew = false;
+      for (int n : B.M.tets[E]) isNew |= n >= nodes && n != B.M.tets[E][i];
+      if (isNew) tauNew.push_back({E, i});
+    }
+  return tauNew;
+}
+
+void projectNewNodesToBoundary(Mesh& M, const TriangleList& tauNew) {
+  for (const BoundaryTriangle& t : tauNew)
+    for (int j = 1; j < 4; ++j) {
+      const int n = M.tets[t.E][(t.i + j) % 4];
+      if (M.dimension[n] == 2) M.x[n] = varphi(surfaceOf(M, M.entity[n]), M.parameter[n]);
+      if (M.dimension[n] == 1) M.x[n] = gamma(M.curves[M.entity[n] - 1], M.parameter[n].x);
+    }
+}
+
+// ==== 2. Algorithm 1: quality optimization =======================================================
+
+namespace {
+
+/// Nodes on the boundary.
+std::vector<int> boundaryNodes(const Mesh& M) {
+  std::vector<char> on(M.x.size(), 0);
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (M.faceLabel[E][i] < 0)
+        for (int j = 1; j < 4; ++j) on[M.tets[E][(i + j) % 4]] = 1;
+  std::vector<int> nodes;
+  for (int n = 0; n < static_cast<int>(on.size()); ++n)
+    if (on[n]) nodes.push_back(n);
+  return nodes;
+}
+
+/// [departure] A tetrahedron with two faces on ∂M flattens where Π makes its patch edge smooth, and
+/// no position of its nodes helps. Its edge across is split, where the faces meet at a larger angle
+/// than this.
+constexpr double flatAngle = 120;  // degrees
+
+/// Splits these edges; returns how many there were.
+int splitFlatCorners(Bisection& B) {
+  const Mesh& M = B.M;
+  const double leastCosine = std::cos(flatAngle * std::acos(-1.) / 180);
+  std::vector<std::pair<int, int>> across;
+  for (const std::array<int, 4>& z : M.tets) {
+    const std::array<int, 4>& label = M.faceLabel[&z - M.tets.data()];
+    for (int i = 0; i < 4; ++i)
+      for (int j = 0; j < i; ++j) {
+        if (label[i] >= 0 || label[j] >= 0) continue;
+        int edge[2], found = 0;
+        for (int k = 0; k < 4; ++k)
+          if (k != i && k != j) edge[found++] = z[k];
+        const Vec3 a = M.x[edge[0]], axis = M.x[edge[1]] - a;
+        const Vec3 u = cross(axis, M.x[z[i]] - a), v = cross(axis, M.x[z[j]] - a);
+        if (dot(u, v) < leastCosine * norm(u) * norm(v)) across.push_back({z[i], z[j]});
+      }
+  }
+  for (const auto& [a, b] : across) B.bisectEdge(a, b);
+  return static_cast<int>(across.size());
+}
+
+/// What the mesher keeps while it works.
+struct Mesher {
+  Mesh& M;
+  const MesherOptions& options;
+  MesherReport& report;
+  CurvedBoundary Omega;
+
+  void progress(const std::string& line) const {
+    if (options.onProgress) options.onProgress(line);
+  }
+  void stage(const char* name) const {
+    if (options.onStage) options.onStage(name, M);
+  }
+};
+
+constexpr double sampledEps = .97;  // [choice] of ε is held where it is sampled: 3 % for between
+
+std::string sizeText(const Mesh& M) { return std::to_string(M.tets.size()) + " tetrahedra"; }
+
+/// The error of a face falls with its area: so many tetrahedra will be there at eps.
+double predictedTets(const Mesh& M, const BoundaryDistance& d, double eps) {
+  double faces = 0, wanted = 0;
+  for (std::size_t E = 0; E < d.ofFace.size(); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (M.faceLabel[E][i] < 0) ++faces, wanted += std::max(1., d.ofFace[E][i] / eps);
+  return static_cast<double>(M.tets.size()) * wanted / std::max(faces, 1.);
+}
+
+/// [§2, Algorithm 1, lines 5 to 9] Refines and projects until the distance is at most eps. Returns
+/// the number of passes.
+int refineToDistance(Mesher& W, double eps) {
+  constexpr int mostLevels = 45;  // [choice] 2^15 edges along one of a cube
+  constexpr int maxPasses = 3 * mostLevels;  // a bisection need not split the face itself
+  Bisection B(W.M);
+  for (int pass = 0; pass < maxPasses; ++pass) {
+    const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
+    if (d.largest() <= eps) return pass;
+    const double predicted = predictedTets(W.M, d, eps);
+    if (predicted > W.options.maxTets)
+      throw InputError("meccanoMesher (§2): eps = " + number(W.options.eps) +
+                       " asks for about " + number(predicted) +
+                       " tetrahedra, above the limit of " + std::to_string(W.options.maxTets) +
+                       "; raise eps or the limit");
+    const TriangleList tau = getTrianglesToRefine(W.M, d, eps);
+    for (const BoundaryTriangle& t : tau)
+      if (W.M.level[t.E] >= mostLevels)
+        throw MethodError("meccanoMesher (§2): the boundary is still " + number(d.largest()) +
+                          " from the solid after " + std::to_string(mostLevels) +
+                          " bisections near " + placeText(W.M.x[W.M.tets[t.E][(t.i + 1) % 4]]) +
+                          ", eps = " + number(W.options.eps) + "; raise eps");
+    projectNewNodesToBoundary(W.M, refineTriangles(B, tau));
+  }
+  throw MethodError("meccanoMesher (§2): distance(∂M, ∂Ω) is above eps = " +
+                    number(W.options.eps) + " after " + std::to_string(maxPasses) +
+                    " passes; raise eps");
+}
+
+/// Untangles with the boundary fixed, [departure] and where a few elements stay inverted, bisects
+/// them for more freedom. Returns the number of inverted elements left.
+int untangleFixed(Mesher& W, bool smooth) {
+  constexpr int maxRounds = 8;
+  OptimizeOptions optimize = W.options.optimize;
+  optimize.starDelta = true;
+  optimize.globalDescent = false;
+  if (!smooth) optimize.power = 1;
+  int fewest = static_cast<int>(W.M.tets.size()) + 1;
+  for (int round = 0;; ++round) {
+    optimize.fixed = boundaryNodes(W.M);
+    const int inverted = optimizeMesh(W.M, optimize).inverted;
+    W.progress("fixed boundary: " + sizeText(W.M) + ", " + std::to_string(inverted) + " inverted");
+    if (inverted == 0 || inverted >= fewest || round == maxRounds) return inverted;
+    fewest = inverted;
+    Bisection B(W.M);
+    const std::vector<double> q = qualities(W.M);
+    for (std::size_t E = 0; E < q.size(); ++E)
+      if (q[E] <= 0) B.bisect(static_cast<int>(E));
+  }
+}
+
+/// The largest distance of Π from a flat face with one of its nodes at another place.
+double movedFaceDistance(const Mesh& M, const BoundaryFace& face, double enough) {
+  constexpr int steps = 4;  // [choice] 12 points
+  const std::array<Vec3, 3> x = placesOf(M, face.n);
+  const Parametrization& P = surfaceOf(M, face.label);
+  double most = 0;
+  anySample(steps, [&](double a, double b, double c) {
+    const Sampled at = sampled(P, x, face.u, a, b, c);
+    double d = norm(at.onSolid - at.onFace);
+    if (d > enough) d = closestPointOnTriangle(at.onSolid, x[0], x[1], x[2]).distance;
+    most = std::max(most, d);
+    return false;
+  });
+  return most;
+}
+
+constexpr double guardedEps = .8;  // [choice] of ε: farther faces must not get worse by sliding
+
+/// Algorithm 2 on all nodes; a boundary node is not moved where a face beside it gets worse than
+/// the guard allows.
+OptimizeReport slideWithin(Mesher& W, double eps) {
+  Mesh& M = W.M;
+  std::vector<std::vector<BoundaryTriangle>> facesAt(M.x.size());
+  for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (M.faceLabel[E][i] < 0 && W.Omega.curved[-M.faceLabel[E][i] - 1])
+        for (int j = 1; j < 4; ++j) facesAt[M.tets[E][(i + j) % 4]].push_back({E, i});
+  OptimizeOptions optimize = W.options.optimize;
+  optimize.globalDescent = false;
+  const double allowed = guardedEps * eps;
+  optimize.accept = [&](int n, Vec3 x, Vec2 parameter) {
+    bool good = true;
+    for (const BoundaryTriangle& at : facesAt[n]) {
+      const double before = movedFaceDistance(M, boundaryFace(M, at), allowed);
+      std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
+      const double after = movedFaceDistance(M, boundaryFace(M, at), allowed);
+      std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
+      good = after <= allowed || after < before;
+      if (!good) break;
+    }
+    return good;
+  };
+  return optimizeMesh(M, optimize);
+}
+
+/// qualityOptimization with ∂Ω prepared.
+void optimizeQuality(Mesher& W) {
+  constexpr int maxRounds = 6;
+  const double eps = sampledEps * W.options.eps;
+  placeInterior(W.M);
+  for (int k = 0; k < maxRounds; ++k) {
+    Bisection B(W.M);
+    if (splitFlatCorners(B) == 0) break;
+  }
+  if (const int left = untangleFixed(W, W.options.fixedBoundary); left > 0)
+    throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
+                      " elements stay inverted with the boundary fixed; lower eps, or give a "
+                      "polycube that fits the solid better");
+  refineToDistance(W, eps);
+  W.report.untangled = qualityStatistics(W.M);
+  W.stage("untangled");
+  if (W.options.fixedBoundary) return;
+  Mesh valid = W.M;
+  double best = 0;
+  for (int round = 1; round <= maxRounds; ++round) {
+    const OptimizeReport o = slideWithin(W, eps);
+    const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
+    W.progress("round " + std::to_string(round) + ": " + sizeText(W.M) + ", min " +
+               number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " +
+               number(d.largest()) + ", " + std::to_string(o.inverted) + " inverted");
+    if (o.inverted == 0 && d.largest() <= eps && o.minQ > best) {
+      best = o.minQ, valid = W.M, W.report.rounds = round;
+      break;
+    }
+    if (o.inverted > 0) break;
+    refineToDistance(W, eps);
+    if (untangleFixed(W, false) > 0) break;
+    const QualityStatistics q = qualityStatistics(W.M);
+    if (q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
+      best = q.min, valid = W.M, W.report.rounds = round;
+  }
+  W.M = std::move(valid);
+}
+
+void checkOptions(const MesherOptions& options) {
+  constexpr int mostTets = 500000000;  // indices of four faces each fit in an int
+  if (!(options.eps > 0) || !std::isfinite(options.eps))
+    throw InputError("meccanoMesher (§2): eps = " + number(options.eps) + " must be above 0");
+  if (options.maxTets < 1 || options.maxTets > mostTets)
+    throw InputError("meccanoMesher (§2): maxTets = " + std::to_string(options.maxTets) +
+                     " must be from 1 to " + std::to_string(mostTets));
+}
+
+}  // namespace
+
+void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& report) {
+  checkMeccano(M, "qualityOptimization (§2)");
+  checkOptions(options);
+  checkOptions(options.optimize, M.x.size());
+  Mesh work = M;
+  Mesher W{work, options, report, curvedBoundary(M)};
+  optimizeQuality(W);
+  M = std::move(work);
+}
+
+// ==== 2. Algorithm 1 =============================================================================
+
+MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
+  checkMeccano(M, "meccanoMesher (§2)");
+  checkOptions(options);
+  checkOptions(options.optimize, M.x.size());
+  MesherReport report;
+  report.eps = options.eps;
+  Mesh work = M;
+  Mesher W{work, options, report, curvedBoundary(M)};
+  W.stage("initial");
+  report.passes = refineToDistance(W, sampledEps * options.eps);
+  report.refined = qualityStatistics(work);
+  W.stage("refined");
+  W.progress("refined: " + sizeText(work) + " after " + std::to_string(report.passes) +
+             " passes, " + std::to_string(report.refined.inverted) + " inverted");
+  optimizeQuality(W);
+  report.distance = distanceTo(work, W.Omega, 0);
+  report.smoothed = qualityStatistics(work);
+  report.regular = qualityStatistics(work, Ideal::regular);
+  for (unsigned char level : work.level) report.depth = std::max<int>(report.depth, level);
+  W.stage("smoothed");
+  M = std::move(work);
+  return report;
+}
+
+MesherReport meccanoMesher(Mesh& M, const TriangleSurface& Omega, const MesherOptions& options) {
+  checkOptions(options);
+  std::vector<std::string> warnings;
+  const TriangleSurface solid = checkSolid(Omega, warnings);
+  const Meccano D = options.meccano.cubes.empty() ? getMeccano(solid) : options.meccano;
+  const BoundaryMapping Pi = getBoundaryMapping(D, solid);
+  if (options.onProgress) {
+    options.onProgress("meccano: " + counted(D.cubes.size(), "cube") + ", " +
+                       counted(Pi.patches.size(), "patch") + ", " +
+                       counted(Pi.curves.size(), "patch edge"));
+    for (const std::string& note : Pi.notes) options.onProgress(note);
+  }
+  Mesh work = getInitialMesh(D, Pi);
+  MesherReport report = meccanoMesher(work, options);
+  report.warnings.insert(report.warnings.begin(), warnings.begin(), warnings.end());
+  M = std::move(work);
+  return report;
+}
+
+MesherReport meccanoMesher(Mesh& M, const Terrain& Omega, const MesherOptions& options) {
+  checkTerrain(Omega);
+  checkOptions(options);
+  const double allowed = bilinearPart * options.eps, missed = terrainDeviation(Omega, allowed);
+  if (missed > 2 * allowed)
+    throw InputError("meccanoMesher (§2): eps = " + number(options.eps) +
+                     " is too small for the terrain's grid, whose cells are twisted by " +
+                     number(missed) + "; raise eps or refine the grid");
+  MesherOptions rest = options;
+  rest.eps = options.eps - missed;
+  Mesh work = terrainMesh(Omega, allowed);
+  MesherReport report = meccanoMesher(work, rest);
+  report.eps = options.eps;
+  M = std::move(work);
+  return report;
+}
+
 // ==== 3.1 Problem statement =====================================================================
 
 namespace {

@@ -4,9 +4,11 @@
 //   Files            reading whole files, writing beside the target and renaming
 //   Text             numbers, words and lines: what all readers and writers stand on
 //   Surfaces         OBJ, OFF, STL, PLY, GOCAD TSurf
+//   ESRI ASCII grids terrain in
+//   Polycubes        meccanos in
 //   VTK legacy       meshes out and in, with all that a later insertion needs
 //   Gmsh, MEDIT      meshes out and in, with labels and names
-//   Commands         box, insert, optimize, stats, convert
+//   Commands         box, terrain, solid, insert, optimize, stats, convert
 //   Arguments        options, help, exit status: 0 done and valid, 1 an error, 2 wrong usage
 #include <unistd.h>
 
@@ -20,6 +22,7 @@
 #include <cstring>
 #include <filesystem>
 #include <iostream>
+#include <limits>
 #include <map>
 #include <memory>
 #include <new>
@@ -173,6 +176,13 @@ std::string format(const char* pattern, Values... values) {
   return std::string(text, std::clamp(n, 0, static_cast<int>(sizeof text) - 1));
 }
 
+std::string upper(std::string_view word) {
+  std::string s(word);
+  for (char& c : s)
+    if (c >= 'a' && c <= 'z') c = static_cast<char>(c - 'a' + 'A');
+  return s;
+}
+
 bool isSpace(char c) { return c == ' ' || c == '\t' || c == '\r' || c == '\n'; }
 
 /// The whole word as a number; false where it is none. A leading + is allowed, as in printf's %+g.
@@ -209,6 +219,13 @@ class Scanner {
     if (end) failHere(std::string("the file ends where ") + what + " should be; it is truncated");
     while (at_ < text_.size() && !isSpace(text_[at_])) ++at_;
     return std::string_view(text_).substr(start_, at_ - start_);
+  }
+  /// The next word, which stays.
+  std::string_view peek() {
+    if (atEnd()) return {};
+    std::size_t end = at_;
+    while (end < text_.size() && !isSpace(text_[end])) ++end;
+    return std::string_view(text_).substr(at_, end - at_);
   }
   bool consumed() const { return at_ == text_.size(); }
   void skip(std::size_t bytes) { at_ += bytes; }
@@ -266,6 +283,20 @@ std::string lower(std::string_view word) {
 
 bool hasByteOrderMark(const std::string& text) { return text.compare(0, 3, "\xEF\xBB\xBF") == 0; }
 
+/// Appends the words of a line, up to a comment (#).
+void splitWords(std::string_view line, std::vector<std::string_view>& words) {
+  for (std::size_t i = 0; i < line.size();) {
+    if (isSpace(line[i])) {
+      ++i;
+      continue;
+    }
+    const std::size_t start = i;
+    while (i < line.size() && !isSpace(line[i])) ++i;
+    if (line[start] == '#') return;
+    words.push_back(line.substr(start, i - start));
+  }
+}
+
 /// A text line by line, each as its words: what all ASCII readers of surfaces stand on. Blank lines
 /// and comments (#) are passed over, a backslash at the end joins the next line.
 class Lines {
@@ -280,10 +311,10 @@ class Lines {
     words.clear();
     while (words.empty() && !in.consumed()) {
       line_ = in.line();
-      split(line_);
+      splitWords(line_, words);
       while (!words.empty() && words.back() == "\\" && !in.consumed()) {
         words.pop_back();
-        split(in.line());
+        splitWords(in.line(), words);
       }
     }
     return !words.empty();
@@ -319,18 +350,6 @@ class Lines {
  private:
   [[noreturn]] void noNumber(std::size_t i, const char* what) const {
     in.failHere("'" + std::string(words[i].substr(0, 40)) + "' is no number; correct " + what);
-  }
-  void split(std::string_view line) {
-    for (std::size_t i = 0; i < line.size();) {
-      if (isSpace(line[i])) {
-        ++i;
-        continue;
-      }
-      const std::size_t start = i;
-      while (i < line.size() && !isSpace(line[i])) ++i;
-      if (line[start] == '#') return;
-      words.push_back(line.substr(start, i - start));
-    }
   }
   std::string_view line_;
 };
@@ -832,6 +851,157 @@ std::vector<TriangleSurface> readSurfaces(const std::string& path,
   return parseSurfaces(path, readFile(path), warnings);
 }
 
+// ==== ESRI ASCII grids ===========================================================================
+
+/// The header: keys in any case and order, until the first line that starts with a number.
+struct AscHeader {
+  std::map<std::string, double> value;
+  double of(const char* key, const Scanner& in) const {
+    const auto found = value.find(key);
+    if (found == value.end())
+      in.failAsWhole(std::string("the key ") + key +
+                     " is missing in the header; is it an ESRI ASCII grid?");
+    return found->second;
+  }
+};
+
+AscHeader readAscHeader(Scanner& in) {
+  static const char* const keys[] = {"ncols",     "nrows",     "xllcorner", "xllcenter",
+                                     "yllcorner", "yllcenter", "cellsize",  "nodata_value"};
+  AscHeader header;
+  double ignored;
+  while (!in.atEnd() && !parse(in.peek(), ignored)) {
+    const std::string key = lower(in.word("a key of the header"));
+    if (std::find(std::begin(keys), std::end(keys), key) == std::end(keys))
+      in.failHere("'" + key.substr(0, 40) +
+                  "' is no key of an ESRI ASCII grid (ncols, nrows, xllcorner or xllcenter, "
+                  "yllcorner or yllcenter, cellsize, NODATA_value)");
+    if (header.value.count(key)) in.failHere(key + " is given twice; keep one");
+    header.value[key] = in.number<double>("its value");
+    if (!std::isfinite(header.value[key])) in.failHere(key + " is not finite; correct it");
+  }
+  return header;
+}
+
+int ascCount(const AscHeader& header, const char* key, const Scanner& in) {
+  constexpr int most = 100000;
+  const double n = header.of(key, in);
+  if (!(n >= 2 && n <= most && n == std::floor(n)))
+    in.failAsWhole(std::string(key) + " = " + format("%.9g", n) + " must be an integer from 2 to " +
+                   std::to_string(most));
+  return static_cast<int>(n);
+}
+
+/// The lowest coordinate of the grid points, which are the centres of the cells.
+double ascOrigin(const AscHeader& header, char axis, double cell, const Scanner& in) {
+  const std::string corner = std::string(1, axis) + "llcorner", centre = std::string(1, axis) + "llcenter";
+  if (header.value.count(corner) && header.value.count(centre))
+    in.failAsWhole(corner + " and " + centre + " are both given; keep one");
+  if (header.value.count(centre)) return header.of(centre.c_str(), in);
+  return header.of(corner.c_str(), in) + .5 * cell;
+}
+
+/// Geographic coordinates lie within +-360, and their cells are small; a grid in metres fits in
+/// there only where it is as small as that.
+void refuseDegrees(const Terrain& T, double relief, const Scanner& in) {
+  const bool geographic = std::abs(T.origin.x) <= 360 && std::abs(T.origin.y) <= 90;
+  const double width = T.cell * std::max(T.nx, T.ny);
+  if (geographic && T.cell < .1 && width <= 360 && relief > width)
+    in.failAsWhole("cellsize " + format("%.9g", T.cell) +
+                   " looks like degrees, and heights in metres need metres: project the grid first "
+                   "(gdalwarp -t_srs EPSG:326ZZ, ZZ the UTM zone; then gdal_translate -of AAIGrid)");
+}
+
+/// One row of heights: from west to east.
+void readAscRow(Scanner& in, Terrain& T, int row, double nodata) {
+  std::vector<std::string_view> words;
+  splitWords(in.line(), words);
+  const std::string name = "row " + std::to_string(row + 1);
+  if (static_cast<int>(words.size()) != T.nx)
+    in.failHere(name + " has " + std::to_string(words.size()) + " heights, ncols promises " +
+                std::to_string(T.nx) + "; complete the row");
+  for (int i = 0; i < T.nx; ++i) {
+    double z = 0;
+    const std::string at = name + ", column " + std::to_string(i + 1) + ": ";
+    if (!parse(words[i], z))
+      in.failHere(at + "'" + std::string(words[i].substr(0, 40)) + "' is no number; correct it");
+    if (z == nodata)
+      in.failHere(at + "no data (" + format("%.9g", z) +
+                  "); cut the grid to where it has heights, or fill the gap");
+    if (!std::isfinite(z)) in.failHere(at + "the height is not finite; correct it");
+    T.z[std::size_t(T.ny - 1 - row) * T.nx + i] = z;
+  }
+}
+
+/// A terrain without its top. Rows go from north to south in the file, upwards in Terrain::z.
+Terrain parseAsc(const std::string& name, const std::string& text) {
+  Scanner in(name, text);
+  if (in.atEnd()) in.failAsWhole("the file is empty; an ESRI ASCII grid is needed");
+  const AscHeader header = readAscHeader(in);
+  Terrain T;
+  T.name = fs::path(name).stem().string();
+  T.nx = ascCount(header, "ncols", in);
+  T.ny = ascCount(header, "nrows", in);
+  T.cell = header.of("cellsize", in);
+  if (!(T.cell > 0)) in.failAsWhole("cellsize must be above 0");
+  T.origin = {ascOrigin(header, 'x', T.cell, in), ascOrigin(header, 'y', T.cell, in)};
+  in.checkRest(std::size_t(T.nx) * T.ny, "heights");
+  T.z.resize(std::size_t(T.nx) * T.ny);
+  constexpr double none = std::numeric_limits<double>::quiet_NaN();
+  const double nodata = header.value.count("nodata_value") ? header.of("nodata_value", in) : none;
+  for (int row = 0; row < T.ny; ++row) {
+    if (in.atEnd())
+      in.failAsWhole("the file ends after " + std::to_string(row) + " rows, nrows promises " +
+                     std::to_string(T.ny) + "; it is truncated");
+    readAscRow(in, T, row, nodata);
+  }
+  if (!in.atEnd())
+    in.failAsWhole("more than the " + std::to_string(T.ny) + " rows that nrows promises");
+  const auto [low, high] = std::minmax_element(T.z.begin(), T.z.end());
+  refuseDegrees(T, *high - *low, in);
+  return T;
+}
+
+Terrain readTerrain(const std::string& path) { return parseAsc(path, readFile(path)); }
+
+// ==== Polycubes =================================================================================
+
+/// `cube i j k` lines, and `corner i j k  x y z` where a corner of the meccano goes; # comments.
+Meccano parsePolycube(const std::string& name, const std::string& text) {
+  constexpr int farthest = 100000;
+  Meccano D;
+  Lines lines(name, text);
+  const std::vector<std::string_view>& words = lines.words;
+  while (lines.next()) {
+    const bool corner = words[0] == "corner";
+    if (!corner && words[0] != "cube")
+      lines.in.failHere("'" + std::string(words[0].substr(0, 40)) +
+                     "' is no line of a polycube; they are `cube i j k` and `corner i j k  x y z`");
+    if (words.size() != (corner ? 7u : 4u))
+      lines.in.failHere(std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
+                     ", here are " + std::to_string(words.size() - 1) + " numbers");
+    std::array<int, 3> at;
+    for (int i = 0; i < 3; ++i)
+      if (!parse(words[i + 1], at[i]) || std::abs(at[i]) > farthest)
+        lines.in.failHere("'" + std::string(words[i + 1].substr(0, 40)) +
+                       "' is no integer of the lattice; correct it");
+    if (!corner) {
+      if (std::find(D.cubes.begin(), D.cubes.end(), at) != D.cubes.end())
+        lines.in.failHere("this cube is given twice; keep one line");
+      D.cubes.push_back(at);
+      continue;
+    }
+    double x[3];
+    for (int i = 0; i < 3; ++i)
+      if (!parse(words[i + 4], x[i]) || !std::isfinite(x[i]))
+        lines.in.failHere("'" + std::string(words[i + 4].substr(0, 40)) +
+                       "' is no coordinate; correct it");
+    D.corners.push_back({at, {x[0], x[1], x[2]}});
+  }
+  if (D.cubes.empty()) lines.in.failAsWhole("no `cube i j k` line in it; is it a polycube?");
+  return D;
+}
+
 // ==== VTK legacy: the arrays ====================================================================
 
 /// A named array of numbers: field, point or cell data.
@@ -1307,13 +1477,6 @@ struct VtkFile {
   std::vector<int> start, nodes, types;  // nodes of cell c: nodes[start[c] .. start[c+1])
   Arrays field, pointData, cellData;
 };
-
-std::string upper(std::string_view word) {
-  std::string s(word);
-  for (char& c : s)
-    if (c >= 'a' && c <= 'z') c = static_cast<char>(c - 'a' + 'A');
-  return s;
-}
 
 Array readArray(Scanner& in, const std::string& name, int components, int tuples) {
   Array a;
@@ -2241,6 +2404,87 @@ void runBox(const Arguments& a, const Streams& io) {
   io.err << path << ": " << sizeOf(M) << std::endl;
 }
 
+/// Table I of a mesh from Algorithm 1, and what it promises.
+void printMesher(const MesherReport& r, const Streams& io) {
+  io.out << tableI({{"refined", &r.refined}, {"untangled", &r.untangled}, {"smoothed", &r.smoothed}})
+         << regularLine(r.regular)
+         << format(
+                "eps %.6g: distance of the mesh's boundary %.6g, of the solid's %.6g; %d bisections "
+                "at most, %d passes, %d rounds of sliding\n",
+                r.eps, r.distance.toSolid, r.distance.toMesh, r.depth, r.passes, r.rounds);
+}
+
+MesherOptions mesherOptions(const Arguments& a, Progress& progress) {
+  MesherOptions o;
+  o.eps = a.number("--eps", o.eps);
+  o.maxTets = a.number("--max-tets", o.maxTets);
+  o.fixedBoundary = a.has("--fixed-boundary");
+  o.optimize.power = a.number("--power", o.optimize.power);
+  o.onProgress = [&progress](const std::string& line) { progress.line(line); };
+  o.optimize.onSweep = [&progress](const Sweep& s) { progress.sweep(s); };
+  return o;
+}
+
+/// Writes a mesh of Algorithm 1 and prints its report.
+void finishMesher(const std::string& path, const Mesh& M, const MesherReport& r, Progress& progress,
+                  const Streams& io) {
+  printMesher(r, io);
+  if (!io.out.flush()) fail("standard output: the results cannot be written; nothing was written");
+  writeFiles({{path, vtkText(M)}});
+  for (const std::string& w : r.warnings) progress.warning(w);
+  progress.line(path + ": " + sizeOf(M));
+}
+
+void runTerrain(const Arguments& a, const Streams& io) {
+  const std::string path = a.output();
+  if (!a.has("--top")) throw UsageError("the height of the top is missing: --top Z");
+  Progress progress(io, a.has("--quiet"));
+  MesherOptions options = mesherOptions(a, progress);
+  if (a.has("--eps") && !(options.eps > 0)) throw UsageError("--eps must be above 0");
+  checkWritable(path);
+  Terrain T = readTerrain(a.operands[0]);
+  T.top = a.number("--top", 0.);
+  if (a.has("--cells"))
+    for (std::size_t i = 0; i < 3; ++i) {
+      T.cells[i] = a.number("--cells", 1, i);
+      if (T.cells[i] < 1) throw UsageError("--cells must be 1 or more");
+    }
+  const std::array<int, 3> cells = terrainCells(T);
+  if (!a.has("--eps")) options.eps = terrainEps(T);
+  progress.line("terrain " + a.operands[0] + ": " + std::to_string(T.nx) + " x " +
+                std::to_string(T.ny) + " heights, " + std::to_string(cells[0]) + " x " +
+                std::to_string(cells[1]) + " x " + std::to_string(cells[2]) + " cells, eps " +
+                format("%.6g", options.eps));
+  Mesh M;
+  const MesherReport report = meccanoMesher(M, T, options);
+  finishMesher(path, M, report, progress, io);
+}
+
+void runSolid(const Arguments& a, const Streams& io) {
+  const std::string path = a.output();
+  if (!a.has("--eps")) throw UsageError("the precision is missing: --eps E");
+  Progress progress(io, a.has("--quiet"));
+  MesherOptions options = mesherOptions(a, progress);
+  if (!(options.eps > 0)) throw UsageError("--eps must be above 0");
+  checkWritable(path);
+  std::vector<std::string> warnings;
+  const std::vector<TriangleSurface> all = readSurfaces(a.operands[0], warnings);
+  for (const std::string& warning : warnings) progress.line("warning: " + warning);
+  if (all.size() != 1)
+    fail(a.operands[0] + ": holds " + std::to_string(all.size()) +
+         " surfaces, and the boundary of one solid is needed; keep one");
+  const TriangleSurface& S = all[0];
+  if (a.has("--polycube")) {
+    const std::string& file = a.options.at("--polycube")[0];
+    options.meccano = parsePolycube(file, readFile(file));
+  }
+  progress.line("solid " + a.operands[0] + ": " + std::to_string(S.points.size()) + " points, " +
+                std::to_string(S.triangles.size()) + " triangles");
+  Mesh M;
+  const MesherReport report = meccanoMesher(M, S, options);
+  finishMesher(path, M, report, progress, io);
+}
+
 /// What insertion needs of a mesh that was read.
 void checkInsertable(const std::string& path, const Mesh& M) {
   if (M.xi.empty())
@@ -2524,6 +2768,8 @@ constexpr Option outputOption{"-o", "OUT", "the mesh to write: .vtk, .msh (Gmsh)
 constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
 constexpr Option powerOption{
     "--power", "P", "exponent of the term that lifts the worst elements (default 48; 1: none)"};
+constexpr Option maxTetsOption{
+    "--max-tets", "N", "refuse where more tetrahedra are predicted (default 20000000)"};
 constexpr Option quietOption{"--quiet", "", "no progress on standard error"};
 
 const std::vector<Command>& commands() {
@@ -2538,6 +2784,37 @@ const std::vector<Command>& commands() {
         {"--size", "X Y Z", "edge lengths (default 1 1 1)"},
         {"--cells", "NX NY NZ", "cells along each axis, near-cubic ones are best (default 1 1 1)"}},
        runBox},
+      {"terrain",
+       "DEM.asc",
+       "Makes the tetrahedral mesh between a terrain and a flat top by Algorithm 1, and prints its\n"
+       "quality. The terrain is an ESRI ASCII grid (heights in the unit of the cells), bilinear\n"
+       "between its points.",
+       1,
+       1,
+       {outputOption,
+        {"--top", "Z", "height of the top"},
+        {"--cells", "NX NY NZ", "cubes of the meccano (default: near-cubic, 8 along the longer side)"},
+        {"--eps", "E", "largest distance from the terrain (default: .002 of the diagonal)"},
+        powerOption,
+        maxTetsOption,
+        quietOption},
+       runTerrain},
+      {"solid",
+       "SURFACE",
+       "Makes the tetrahedral mesh of the solid inside a closed surface by Algorithm 1, and prints\n"
+       "its quality. Without a polycube the meccano is a box of cubes, for solids without handles.\n"
+       "A polycube file has a line `cube i j k` for each cube, and `corner i j k  x y z` for each\n"
+       "corner of their union: the point of the solid where it goes.",
+       1,
+       1,
+       {outputOption,
+        {"--eps", "E", "largest distance from the surface, in the unit of the input"},
+        {"--polycube", "FILE", "the meccano and where its corners go"},
+        {"--fixed-boundary", "", "boundary nodes stay where the boundary mapping puts them"},
+        powerOption,
+        maxTetsOption,
+        quietOption},
+       runSolid},
       {"insert",
        "MESH.vtk SURFACE [SURFACE ...]",
        "Inserts triangulated surfaces into a mesh that meccano wrote, one after the other, and "
@@ -2554,7 +2831,7 @@ const std::vector<Command>& commands() {
         {"--stages", "PREFIX",
          "also write PREFIX-{original,refined,projected,smoothed}.vtk (of several surfaces\n"
          "                       PREFIX-1-refined.vtk, ...)"},
-        {"--max-tets", "N", "refuse where more tetrahedra are predicted (default 20000000)"},
+        maxTetsOption,
         quietOption},
        runInsert},
       {"optimize",
@@ -2598,7 +2875,9 @@ std::string usageLine(const Command& c) {
   if (*c.operands) line += std::string(" ") + c.operands;
   for (const Option& o : c.options) {
     const std::string one = std::string(o.name) + (*o.values ? " " : "") + o.values;
-    const bool needed = std::string(o.name) == "-o" || std::string(o.name) == "--lc";
+    const std::string name = o.name;
+    const bool needed = name == "-o" || name == "--lc" || name == "--top" ||
+                        (name == "--eps" && std::string(c.name) == "solid");
     line += needed ? " " + one : " [" + one + "]";
   }
   return line;

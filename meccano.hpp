@@ -205,6 +205,10 @@ struct OptimizeOptions {
   double relaxation = 1.6;
   std::vector<int> fixed = {};   // nodes that stay where they are, besides the corners
   std::vector<int> active = {};  // nodes visited in the first sweep; empty: all
+  // [§2 choice] δ from each star's own σ, for meshes whose σ spans orders of magnitude
+  bool starDelta = false;
+  // [§2 choice] asked before a sliding node n moves to x at this parameter; false: it stays
+  std::function<bool(int n, Vec3 x, Vec2 parameter)> accept = nullptr;
   std::function<void(const Sweep&)> onSweep = nullptr;  // called after each sweep
 
   static OptimizeOptions paper();  // Algorithm 2 to the letter: Σ η alone, numerical derivatives
@@ -400,6 +404,89 @@ const Parametrization& surfaceOf(const Mesh& M, int label);
 /// Faces labelled k (S_M of inserted surface k, or boundary patch -k), each once. [faces], node
 /// indices
 std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
+
+// ==== 2. Algorithm 1: the meccano mesher ========================================================
+
+/// A terrain: heights on a regular grid, bilinear between its points, under a flat top.
+struct Terrain {
+  int nx = 0, ny = 0;     // grid points along x and along y, >= 2
+  Vec2 origin;            // of the point (0, 0), the south-west one
+  double cell = 0;        // distance of neighbouring grid points, length unit of z; > 0
+  std::vector<double> z;  // [nx * ny], height of point (i, j) in z[j * nx + i]
+  double top = 0;         // height of the flat top, above all z
+  std::array<int, 3> cells{0, 0, 0};  // cubes of the meccano along each axis; 0: near-cubic ones
+  std::string name = {};
+};
+/// The bilinear height over (x, y), clamped to the grid.
+double heightAt(const Terrain& T, double x, double y);
+/// Its cells, or near-cubic ones: about eight along the longer side.
+std::array<int, 3> terrainCells(const Terrain& T);
+/// ε that fits: 1/500 of the diagonal of its box.
+double terrainEps(const Terrain& T);
+
+struct MesherOptions {
+  double eps = 0;              // [Algorithm 1] ε, length unit of the input; > 0
+  Meccano meccano = {};        // D; without cubes: getMeccano's
+  bool fixedBoundary = false;  // boundary nodes stay where Π put them
+  int maxTets = 20000000;      // refuse where more tetrahedra are predicted
+  OptimizeOptions optimize;    // §3.7; its fixed, active, accept and starDelta are the mesher's
+  // Called after each stage with the mesh as it is then: "initial" (line 4), "refined" (line 9),
+  // "untangled", "smoothed" (line 10).
+  std::function<void(const char* stage, const Mesh&)> onStage = nullptr;
+  std::function<void(const std::string& line)> onProgress = nullptr;  // a line per step
+};
+
+/// distance(∂M, ∂Ω) of Algorithm 1, both ways.
+struct BoundaryDistance {
+  double toSolid = 0, toMesh = 0;  // largest distance of ∂M from ∂Ω, of ∂Ω from ∂M
+  std::vector<std::array<double, 4>> ofFace;  // [tets], of each face on the boundary; 0 elsewhere
+  double largest() const { return std::max(toSolid, toMesh); }
+};
+
+struct MesherReport {
+  double eps = 0;                  // as used
+  BoundaryDistance distance;       // of the final mesh, at most eps
+  int depth = 0;                   // bisections since the cube, the most of all tetrahedra
+  int passes = 0;                  // of lines 5 to 9, before the optimization
+  int rounds = 0;                  // of qualityOptimization in which the boundary slid
+  QualityStatistics refined, untangled, smoothed;  // against the computational elements
+  QualityStatistics regular;       // smoothed, against the regular tetrahedron
+  std::vector<std::string> warnings;
+};
+
+/// A triangle of ∂M: the face of tetrahedron E opposite to its vertex i.
+struct BoundaryTriangle {
+  int E, i;
+};
+using TriangleList = std::vector<BoundaryTriangle>;
+
+/// [§2, Algorithm 1] distance(∂M, ∂Ω), ∂Ω being the patches of M. [choice] Two-sided: Π at sample
+/// points of each face against the face, and each point of a patch against the face that holds its
+/// parameter. Planar patches are met exactly and are not measured.
+///   enough  a distance in the parameters below it is taken for the distance (an upper bound)
+BoundaryDistance distance(const Mesh& M, double enough = 0);
+/// [§2, Algorithm 1, line 6] The triangles of ∂M farther than eps.
+TriangleList getTrianglesToRefine(const Mesh& M, const BoundaryDistance& d, double eps);
+/// [§2, Algorithm 1, line 7] Bisects the tetrahedron behind each; returns the triangles of ∂M that
+/// are new.
+TriangleList refineTriangles(Bisection& B, const TriangleList& tau);
+/// [§2, Algorithm 1, line 8] Puts their nodes at Π of their parameters.
+void projectNewNodesToBoundary(Mesh& M, const TriangleList& tauNew);
+/// [§2, Algorithm 1, line 10] Untangles with a fixed boundary, then lets the boundary slide within
+/// eps and refines where it is exceeded, until both hold.
+///   errors  MethodError where elements stay inverted
+void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& report);
+
+/// [§2, Algorithm 1] MeccanoMesher: the solid inside the closed surface Omega, within eps.
+///   errors  InputError: the solid, the meccano or the options; MethodError, SolverError. M is
+///           unchanged when it throws.
+MesherReport meccanoMesher(Mesh& M, const TriangleSurface& Omega, const MesherOptions& options);
+/// [§2, Algorithm 1] The box below `top`, its bottom within eps of the bilinear terrain, its sides
+/// in their planes.
+///   errors  InputError: the terrain or the options; MethodError. M is unchanged when it throws.
+MesherReport meccanoMesher(Mesh& M, const Terrain& Omega, const MesherOptions& options);
+/// [§2, Algorithm 1] Lines 5 to 10 from an initial mesh, with Π as its patches.
+MesherReport meccanoMesher(Mesh& M, const MesherOptions& options);
 
 // ==== 3.1 Problem statement =====================================================================
 

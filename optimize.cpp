@@ -449,7 +449,9 @@ struct Smoother {
   std::vector<int> sheetStart = {};  // [nodes + 1] surface triangles at n, rows of sheet
   std::vector<SheetTriangle> sheet = {};
 
-  double delta = 0;  // of the sweep, relative to the mean σ
+  double delta = 0;      // of the sweep, relative to the mean σ
+  bool tangled = false;  // of the mesh, and the rung of the schedule for μ
+  int rung = 0;
   Penalty penalty = plainEta;
   double wake = 0;                       // unrest from which a node is visited
   std::vector<StarElement> around = {};  // the star under visit; kept to save allocations
@@ -657,15 +659,29 @@ double visitSliding(Smoother& S, int n, const Edges& edges) {
   for (int k = 0; !isStep(t); t /= 2)
     if (++k == wolfeEvaluations) return 0;
   const Place at = placeOf(S.M, n, u + t * p);
+  if (S.options.accept && !S.options.accept(n, at.x, at.parameter)) return 0;
   S.M.x[n] = at.x;
   S.M.parameter[n] = at.parameter;
   return norm(at.x - x);
+}
+
+constexpr double starLadder[3] = {1e-2, 1e-4, 1e-6};  // μ of the star's mean |σ|
+
+/// [§2 choice] δ of the star under visit: 0 where it is valid.
+double starDelta(const Smoother& S) {
+  double least = unbounded, mean = 0;
+  for (const StarElement& e : S.around) {
+    least = std::min(least, e.sigma);
+    mean += std::abs(e.sigma) / static_cast<double>(S.around.size());
+  }
+  return mean > 0 ? mean * chooseDelta(least / mean, starLadder[S.rung]) : S.delta;
 }
 
 /// [§3.7.4, Algorithm 2] smoothNode: returns the displacement relative to the node's shortest edge.
 double smoothNode(Smoother& S, int n) {
   const Edges edges = gatherStar(S, n);
   if (!(edges.longest > 0)) return 0;
+  if (S.options.starDelta && S.tangled) S.delta = starDelta(S);
   const double moved = S.freedom[n] == 3 ? visitInner(S, n, edges) : visitSliding(S, n, edges);
   return moved / std::max(edges.shortest, DBL_EPSILON * edges.longest);
 }
@@ -872,6 +888,8 @@ bool untangleAndSmooth(Smoother& S) {
       continue;
     }
     S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted)) : 0;
+    S.tangled = tangled;
+    S.rung = schedule.rung;
     S.report.disp = sweepNodes(S);
     if (!tangled && S.report.disp <= S.options.maxDisp) return true;
   }

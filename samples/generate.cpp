@@ -8,6 +8,8 @@
 #include <iostream>
 #include <string>
 
+#define MECCANO_NO_MAIN
+#include "../main.cpp"
 #include "surfaces.hpp"
 
 namespace {
@@ -17,8 +19,12 @@ using meccano::Vec3;
 namespace samples = meccano::samples;
 
 constexpr const char* help =
-    "usage: generate DIR                              writes DIR/cube_sine, DIR/faults\n"
-    "       generate --surface NAME [ARGS] FILE.obj   writes one surface\n"
+    "usage: generate DIR                                    writes DIR/cube_sine, /faults, /layers\n"
+    "       generate --surface NAME [ARGS] FILE.obj         writes one surface\n"
+    "       generate --island N FILE.asc                    a synthetic island of N x N heights\n"
+    "       generate --layer DEM.asc HEIGHT MARGIN SMOOTH FILE.obj\n"
+    "           the terrain, its heights averaged SMOOTH times over 3 x 3, lifted by HEIGHT, up\n"
+    "           to MARGIN before its sides\n"
     "\n"
     "NAME [ARGS] (default)    all but fault in the unit cube, formulas in surfaces.hpp\n"
     "  sine A (.1) N (64)     z = .5 + A sin(2 pi x), N x N x 2 triangles\n"
@@ -98,6 +104,39 @@ void writeFaults(const std::string& folder) {
   for (const TriangleSurface& S : samples::faults()) writeTs(S, folder + "/" + S.name + ".ts");
 }
 
+void writeAsc(const meccano::Terrain& T, const std::string& file) {
+  std::ofstream out(file);
+  out << "ncols " << T.nx << "\nnrows " << T.ny << "\nxllcenter " << shortest(T.origin.x)
+      << "\nyllcenter " << shortest(T.origin.y) << "\ncellsize " << shortest(T.cell) << "\n";
+  for (int j = T.ny - 1; j >= 0; --j)
+    for (int i = 0; i < T.nx; ++i)
+      out << shortest(T.z[j * T.nx + i]) << (i + 1 < T.nx ? " " : "\n");
+  checkWritten(out, file);
+}
+
+/// A sheet of the generator with OBJ's relative indices, each cell after its last vertex.
+void writeLayer(const TriangleSurface& S, const std::string& file) {
+  const int n = S.triangles[0][1];  // points of a column
+  std::ofstream out(file);
+  for (int k = 0; k < static_cast<int>(S.points.size()); ++k) {
+    out << vertexLine(S.points[k]);
+    if (k > n && k % n > 0)
+      out << "f " << -n - 2 << " -2 -1\nf " << -n - 2 << " -1 " << -n - 1 << "\n";
+  }
+  checkWritten(out, file);
+}
+
+/// §4.3.1 in small, below 200 kB: an island and two layers 1000 m and 2000 m above it.
+void writeLayersSample(const std::string& folder) {
+  constexpr int points = 51;
+  constexpr double margin = 2048;
+  const meccano::Terrain T = samples::island(points);
+  writeAsc(T, folder + "/island.asc");
+  for (int height : {1000, 2000})
+    writeLayer(samples::layer(T, height, margin),
+               folder + "/layer_" + std::to_string(height) + ".obj");
+}
+
 /// Argument i of the surface, a number, or its default.
 double argument(const std::vector<std::string>& args, std::size_t i, double otherwise) {
   if (i >= args.size()) return otherwise;
@@ -137,10 +176,20 @@ int main(int argc, char** argv) {
       std::cout << help;
     } else if (args.size() >= 3 && args[0] == "--surface") {
       writeObj(surfaceByName(args[1], {args.begin() + 2, args.end() - 1}), args.back());
+    } else if (args.size() == 3 && args[0] == "--island") {
+      writeAsc(samples::island(static_cast<int>(argument(args, 1, 0))), args[2]);
+    } else if (args.size() == 6 && args[0] == "--layer") {
+      const meccano::Terrain T = meccano::app::readTerrain(args[1]);
+      const int times = static_cast<int>(argument(args, 4, 0));
+      writeObj(samples::layer(samples::smoothed(T, times), argument(args, 2, 0),
+                              argument(args, 3, 0)),
+               args[5]);
     } else if (args.size() == 1 && args[0][0] != '-') {
       std::filesystem::create_directories(args[0] + "/cube_sine");
       writeSineSample(args[0] + "/cube_sine/sine.obj");
       writeFaults(args[0] + "/faults");
+      std::filesystem::create_directories(args[0] + "/layers");
+      writeLayersSample(args[0] + "/layers");
     } else {
       std::cerr << help;
       return 2;

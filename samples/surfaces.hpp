@@ -349,5 +349,67 @@ inline std::vector<TriangleSurface> faults() {
   return {named(west, "west"), named(east, "east"), named(ring, "ring"), named(lobe, "lobe")};
 }
 
+// ==== Terrain and layers ========================================================================
+
+/// An island of 25.6 km by 25.6 km in the sea (height 0), n x n grid points: a cone of 1800 m with
+/// six ridges and their valleys, two side craters, and waves of a few kilometres on its slopes.
+inline Terrain island(int n) {
+  constexpr double side = 25600;
+  Terrain T;
+  T.name = "island";
+  T.nx = T.ny = n;
+  T.cell = side / (n - 1);
+  for (int j = 0; j < n; ++j)
+    for (int i = 0; i < n; ++i) {
+      const double x = double(i) / (n - 1) - .48, y = double(j) / (n - 1) - .53;
+      const double r = std::hypot(x, y), a = std::atan2(y, x);
+      const double coast = .36 + .04 * std::sin(3 * a + .5) + .02 * std::sin(5 * a);
+      const double cone = 1800 * std::max(0., 1 - r / coast);
+      const double ridges = 1 + .22 * std::sin(6 * a + 8 * r) * std::min(1., 4 * r);
+      const double waves = 60 * std::sin(19 * x + 3 * y) * std::sin(23 * y - 2 * x);
+      auto crater = [&](double u, double v) {
+        const double d = (x - u) * (x - u) + (y - v) * (y - v);
+        return 260 * (std::exp(-d / .0025) - 1.2 * std::exp(-d / .0005));
+      };
+      const double z = cone * ridges + std::min(1., cone / 300) * (waves + crater(.17, .05) +
+                                                                    crater(-.1, -.16));
+      T.z.push_back(std::round(std::max(0., z)));
+    }
+  return T;
+}
+
+/// Each height the mean of the 3 x 3 around it, so many times.
+inline Terrain smoothed(Terrain T, int times) {
+  for (; times > 0; --times) {
+    const std::vector<double> z = T.z;
+    for (int j = 0; j < T.ny; ++j)
+      for (int i = 0; i < T.nx; ++i) {
+        double sum = 0;
+        int count = 0;
+        for (int b = std::max(0, j - 1); b <= std::min(T.ny - 1, j + 1); ++b)
+          for (int a = std::max(0, i - 1); a <= std::min(T.nx - 1, i + 1); ++a, ++count)
+            sum += z[b * T.nx + a];
+        T.z[j * T.nx + i] = sum / count;
+      }
+  }
+  return T;
+}
+
+/// The terrain lifted by `height`, ending `margin` before its sides (§4.3.1).
+inline TriangleSurface layer(const Terrain& T, double height, double margin) {
+  const int rim = static_cast<int>(std::ceil(margin / T.cell));
+  if (2 * rim + 1 >= std::min(T.nx, T.ny)) throw InputError("layer: no terrain within the margin");
+  return named(sheet(T.nx - 1 - 2 * rim, T.ny - 1 - 2 * rim,
+                     [&](double s, double t) {
+                       const double i = .5 * (T.nx - 1) + s * (.5 * (T.nx - 1) - rim);
+                       const double j = .5 * (T.ny - 1) + t * (.5 * (T.ny - 1) - rim);
+                       const int a = static_cast<int>(std::lround(i)),
+                                 b = static_cast<int>(std::lround(j));
+                       return Vec3{T.origin.x + T.cell * a, T.origin.y + T.cell * b,
+                                   T.z[b * T.nx + a] + height};
+                     }),
+               "layer");
+}
+
 }  // namespace meccano::samples
 #endif
