@@ -697,7 +697,8 @@ using Selection = std::vector<unsigned char>;
 struct Extraction {
   Selection selected;
   double energy = 0;  // what sides are ranked by: rim energy and interior coverage
-  std::string fault;  // why it is no disk; empty: it is one
+  std::string fault;  // why it is no disk, or cannot be used; empty: it is one
+  bool isBlocked = false;  // because another surface is in the way
 };
 /// [§3.4] The squares with all nodes on this side (±1) of S, one disk; then the outline's healing:
 /// cases 1 and 2 of §3.5, or [departure] rim regularization, with half squares where asked for.
