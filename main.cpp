@@ -1756,12 +1756,12 @@ std::vector<std::string> captionOf(const Mesh& M, const PictureOptions& o, const
   const QualityStatistics q = qualityStatistics(M);
   std::vector<std::string> lines{
       format("Behind %s: %d of %d tetrahedra, %d faces seen", nameOf(o.cut).c_str(), D.shown,
-             q.tetrahedra, D.visible) +
-          (D.reduced.empty() ? "" : ", " + D.reduced),
+             q.tetrahedra, D.visible),
       format("q of all tetrahedra: min %.3f, mean %.3f, std dev %.3f; inverted %d", q.min, q.mean,
              q.stdDev, q.inverted)};
-  if (!o.line.empty()) lines[0] += "; bold: the surface to insert";
-  if (o.colour == Colour::quality && M.xi.empty()) lines[1] += "; ideal: regular tetrahedra";
+  if (!o.line.empty()) lines.push_back("Bold: where the surface will come");
+  if (M.xi.empty()) lines.push_back("Ideal elements: regular tetrahedra");
+  if (!D.reduced.empty()) lines.push_back("Faces are " + D.reduced);
   return lines;
 }
 
@@ -1814,7 +1814,7 @@ std::string pictureText(const Mesh& M, const PictureOptions& o) {
   const int lines = static_cast<int>(caption.size());
   putPage(out, x + legendWidth, bottom + gap + lineHeight * lines, escaped(o.title, 200));
   out << boldStyle;
-  putText(out, margin, margin + 6, escaped(o.title, 70), " font-weight=\"bold\" font-size=\"15\"");
+  putText(out, margin, margin + 6, escaped(o.title, 50), " font-weight=\"bold\" font-size=\"15\"");
   const double top = margin + lineHeight + 8 + .5 * (bottom - margin - lineHeight - 8 - D.height);
   out << format("<g transform=\"translate(%.1f %.1f)\">\n", margin + .5 * (meshWidth - D.width),
                 top)
@@ -1856,7 +1856,7 @@ std::string histogramText(const QualityStatistics& q, const std::string& title, 
   const int highest = std::max(1, *std::max_element(q.histogram.begin(), q.histogram.end()));
   Text out;
   putPage(out, x + width + margin, y + height + 106, escaped(title, 200));
-  putText(out, margin, margin + 6, escaped(title, 70), " font-weight=\"bold\" font-size=\"15\"");
+  putText(out, margin, margin + 6, escaped(title, 50), " font-weight=\"bold\" font-size=\"15\"");
   putHistogramAxes(out, x, y, width, height, highest);
   const double step = width / qualityClasses;
   auto bar = [&](int c, int n, const std::string& fill) {

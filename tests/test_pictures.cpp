@@ -348,7 +348,7 @@ TEST_SUITE("pictures") {
     }
     const std::string original = readFile(folder / "p_original.svg");
     CHECK(holds(original, "24 of 48 tetrahedra"));
-    CHECK(holds(original, "bold: the surface to insert"));
+    CHECK(holds(original, "Bold: where the surface will come"));
     CHECK(statusOf({"insert", box, obj, "-o", out, "--lc", ".14", "--pictures", folder / "no/p"},
                    &err) == 1);
     CHECK(holds(err, "no/p_original.svg"));
