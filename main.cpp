@@ -895,7 +895,8 @@ int ascCount(const AscHeader& header, const char* key, const Scanner& in) {
 
 /// The lowest coordinate of the grid points, which are the centres of the cells.
 double ascOrigin(const AscHeader& header, char axis, double cell, const Scanner& in) {
-  const std::string corner = std::string(1, axis) + "llcorner", centre = std::string(1, axis) + "llcenter";
+  const std::string corner = std::string(1, axis) + "llcorner",
+                    centre = std::string(1, axis) + "llcenter";
   if (header.value.count(corner) && header.value.count(centre))
     in.failAsWhole(corner + " and " + centre + " are both given; keep one");
   if (header.value.count(centre)) return header.of(centre.c_str(), in);
@@ -908,9 +909,10 @@ void refuseDegrees(const Terrain& T, double relief, const Scanner& in) {
   const bool geographic = std::abs(T.origin.x) <= 360 && std::abs(T.origin.y) <= 90;
   const double width = T.cell * std::max(T.nx, T.ny);
   if (geographic && T.cell < .1 && width <= 360 && relief > width)
-    in.failAsWhole("cellsize " + format("%.9g", T.cell) +
-                   " looks like degrees, and heights in metres need metres: project the grid first "
-                   "(gdalwarp -t_srs EPSG:326ZZ, ZZ the UTM zone; then gdal_translate -of AAIGrid)");
+    in.failAsWhole(
+        "cellsize " + format("%.9g", T.cell) +
+        " looks like degrees, and heights in metres need metres: project the grid first "
+        "(gdalwarp -t_srs EPSG:326ZZ, ZZ the UTM zone; then gdal_translate -of AAIGrid)");
 }
 
 /// One row of heights: from west to east.
@@ -976,16 +978,18 @@ Meccano parsePolycube(const std::string& name, const std::string& text) {
   while (lines.next()) {
     const bool corner = words[0] == "corner";
     if (!corner && words[0] != "cube")
-      lines.in.failHere("'" + std::string(words[0].substr(0, 40)) +
-                     "' is no line of a polycube; they are `cube i j k` and `corner i j k  x y z`");
+      lines.in.failHere(
+          "'" + std::string(words[0].substr(0, 40)) +
+          "' is no line of a polycube; they are `cube i j k` and `corner i j k  x y z`");
     if (words.size() != (corner ? 7u : 4u))
-      lines.in.failHere(std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
-                     ", here are " + std::to_string(words.size() - 1) + " numbers");
+      lines.in.failHere(
+          std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
+          ", here are " + std::to_string(words.size() - 1) + " numbers");
     std::array<int, 3> at;
     for (int i = 0; i < 3; ++i)
       if (!parse(words[i + 1], at[i]) || std::abs(at[i]) > farthest)
         lines.in.failHere("'" + std::string(words[i + 1].substr(0, 40)) +
-                       "' is no integer of the lattice; correct it");
+                          "' is no integer of the lattice; correct it");
     if (!corner) {
       if (std::find(D.cubes.begin(), D.cubes.end(), at) != D.cubes.end())
         lines.in.failHere("this cube is given twice; keep one line");
@@ -996,7 +1000,7 @@ Meccano parsePolycube(const std::string& name, const std::string& text) {
     for (int i = 0; i < 3; ++i)
       if (!parse(words[i + 4], x[i]) || !std::isfinite(x[i]))
         lines.in.failHere("'" + std::string(words[i + 4].substr(0, 40)) +
-                       "' is no coordinate; correct it");
+                          "' is no coordinate; correct it");
     D.corners.push_back({at, {x[0], x[1], x[2]}});
   }
   if (D.cubes.empty()) lines.in.failAsWhole("no `cube i j k` line in it; is it a polycube?");
@@ -1398,10 +1402,40 @@ std::string vtkText(const Mesh& M) {
 
 // ==== Meshes without a meccano: faces by their groups ===========================================
 
-/// A triangle of a mesh file with the number of its group, > 0.
+/// A triangle of a mesh file with the number of its group or its label.
 struct TaggedFace {
   std::array<int, 3> nodes;
   int tag;
+  int uses = 0;  // as a face of a tetrahedron
+};
+
+/// The triangles of a file by their nodes, to be found again among the faces of its tetrahedra.
+class FaceIndex {
+ public:
+  std::vector<TaggedFace> faces;  // nodes ascending, in their order
+
+  FaceIndex(const std::vector<TaggedFace>& list, std::size_t nodes) : faces(list), used_(nodes) {
+    for (TaggedFace& f : faces) {
+      for (int n : f.nodes) used_[n] = 1;
+      std::sort(f.nodes.begin(), f.nodes.end());
+    }
+    std::stable_sort(faces.begin(), faces.end(), less);
+  }
+  /// Face i of the tetrahedron z, one use more of it; nullptr where the file has no such triangle.
+  const TaggedFace* use(const std::array<int, 4>& z, int i) {
+    TaggedFace key{{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]}, 0};
+    for (int n : key.nodes)
+      if (!used_[n]) return nullptr;
+    std::sort(key.nodes.begin(), key.nodes.end());
+    const auto at = std::lower_bound(faces.begin(), faces.end(), key, less);
+    if (at == faces.end() || at->nodes != key.nodes) return nullptr;
+    ++at->uses;
+    return &*at;
+  }
+
+ private:
+  static bool less(const TaggedFace& a, const TaggedFace& b) { return a.nodes < b.nodes; }
+  std::vector<char> used_;  // [nodes]
 };
 
 /// A mesh as a file has it. Only .vtk files of meccano fill more than M's x, tets and faceLabel,
@@ -1414,32 +1448,20 @@ struct MeshFile {
 
 /// Labels the faces that the file's triangles name: groups inside the mesh become surfaces 1, 2,
 /// ..., groups on its boundary patches 1, 2, ..., both in the order of their numbers.
-void labelByTags(MeshFile& file, std::vector<TaggedFace> faces,
+void labelByTags(MeshFile& file, const std::vector<TaggedFace>& faces,
                  const std::map<int, std::string>& names = {}) {
   if (faces.empty()) return;
   Mesh& M = file.M;
-  std::vector<char> used(M.x.size(), 0);
-  for (TaggedFace& f : faces) {
-    for (int n : f.nodes) used[n] = 1;
-    std::sort(f.nodes.begin(), f.nodes.end());
-  }
-  const auto less = [](const TaggedFace& a, const TaggedFace& b) { return a.nodes < b.nodes; };
-  std::stable_sort(faces.begin(), faces.end(), less);
-  std::vector<char> found(faces.size(), 0);
+  FaceIndex index(faces, M.x.size());
   const std::vector<std::array<int, 4>> neighbour = faceNeighbours(M);
   M.faceLabel.assign(M.tets.size(), {0, 0, 0, 0});
   std::map<int, int> surfaces, patches;  // tag -> number
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int i = 0; i < 4; ++i) {
-      const std::array<int, 4>& z = M.tets[E];
-      TaggedFace key{{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]}, 0};
-      if (!used[key.nodes[0]] || !used[key.nodes[1]] || !used[key.nodes[2]]) continue;
-      std::sort(key.nodes.begin(), key.nodes.end());
-      const auto at = std::lower_bound(faces.begin(), faces.end(), key, less);
-      if (at == faces.end() || at->nodes != key.nodes) continue;
-      found[at - faces.begin()] = 1;
-      M.faceLabel[E][i] = neighbour[E][i] < 0 ? -at->tag : at->tag;
-      (neighbour[E][i] < 0 ? patches : surfaces)[at->tag] = 0;
+      const TaggedFace* f = index.use(M.tets[E], i);
+      if (!f) continue;
+      M.faceLabel[E][i] = neighbour[E][i] < 0 ? -f->tag : f->tag;
+      (neighbour[E][i] < 0 ? patches : surfaces)[f->tag] = 0;
     }
   const auto number = [&](std::map<int, int>& tags, std::vector<Parametrization>& list,
                           const char* word) {
@@ -1455,7 +1477,8 @@ void labelByTags(MeshFile& file, std::vector<TaggedFace> faces,
     for (int& label : labels)
       label = label < 0 ? -patches[-label] : label > 0 ? surfaces[label] : 0;
   if (surfaces.empty() && patches.empty()) M.faceLabel.clear();
-  const auto strays = std::count(found.begin(), found.end(), 0);
+  const auto strays = std::count_if(index.faces.begin(), index.faces.end(),
+                                    [](const TaggedFace& f) { return f.uses == 0; });
   if (strays > 0)
     file.warnings.push_back(std::to_string(strays) +
                             " triangles are no faces of its tetrahedra, or there twice: left out");
@@ -1689,40 +1712,33 @@ void orderForBisection(Mesh& M, const Scanner& in) {
   }
 }
 
+bool isTriangle(const VtkFile& file, std::size_t c) {
+  constexpr int triangle = 5;
+  return file.types[c] == triangle && file.start[c + 1] - file.start[c] == 3;
+}
+
+/// The nodes of a triangle.
+std::array<int, 3> cornersOf(const VtkFile& file, std::size_t c) {
+  const int first = file.start[c];
+  return {file.nodes[first], file.nodes[first + 1], file.nodes[first + 2]};
+}
+
 /// Finds the file's triangles among the faces, and refuses a boundary without its patches.
 void labelFaces(const VtkFile& file, Mesh& M, const Scanner& in) {
-  constexpr int triangle = 5;
-  using Key = std::array<int, 3>;
-  struct Labelled {
-    Key key;
-    int label, uses;
-  };
-  std::vector<Labelled> faces;
+  std::vector<TaggedFace> triangles;
   Unpacking surface(file.cellData, "surface", 1, in);
-  std::vector<char> used(M.x.size(), 0);
   for (std::size_t c = 0; c < file.types.size(); ++c) {
     const int label = surface.integer(-static_cast<int>(M.patches.size()), INT_MAX);
-    if (file.types[c] != triangle || file.start[c + 1] - file.start[c] != 3) continue;
-    const int* n = &file.nodes[file.start[c]];
-    faces.push_back({{n[0], n[1], n[2]}, label, 0});
-    std::sort(faces.back().key.begin(), faces.back().key.end());
-    for (int i = 0; i < 3; ++i) used[n[i]] = 1;
+    if (isTriangle(file, c)) triangles.push_back({cornersOf(file, c), label});
   }
-  auto less = [](const Labelled& a, const Labelled& b) { return a.key < b.key; };
-  std::sort(faces.begin(), faces.end(), less);
+  FaceIndex index(triangles, M.x.size());
   const std::vector<std::array<int, 4>> neighbour = faceNeighbours(M);
   M.faceLabel.assign(M.tets.size(), {0, 0, 0, 0});
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int i = 0; i < 4; ++i) {
-      const std::array<int, 4>& z = M.tets[E];
-      Key key{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
+      const TaggedFace* f = index.use(M.tets[E], i);
+      const int label = f ? f->tag : 0;
       const bool boundary = neighbour[E][i] < 0;
-      int label = 0;
-      if (used[key[0]] && used[key[1]] && used[key[2]]) {
-        std::sort(key.begin(), key.end());
-        const auto at = std::lower_bound(faces.begin(), faces.end(), Labelled{key, 0, 0}, less);
-        if (at != faces.end() && at->key == key) label = at->label, ++at->uses;
-      }
       if (boundary != (label < 0))
         in.failAsWhole("face " + std::to_string(i) + " of tetrahedron " + std::to_string(E) +
                        (boundary ? " lies on the boundary, and no patch is named for it"
@@ -1730,10 +1746,10 @@ void labelFaces(const VtkFile& file, Mesh& M, const Scanner& in) {
                        "; use the file as meccano wrote it");
       M.faceLabel[E][i] = label;
     }
-  for (const Labelled& f : faces)  // one that is there twice has no use the second time
-    if (f.uses != (f.label > 0 ? 2 : 1))
-      in.failAsWhole("the triangle of nodes " + std::to_string(f.key[0]) + " " +
-                     std::to_string(f.key[1]) + " " + std::to_string(f.key[2]) +
+  for (const TaggedFace& f : index.faces)  // one that is there twice has no use the second time
+    if (f.uses != (f.tag > 0 ? 2 : 1))
+      in.failAsWhole("the triangle of nodes " + std::to_string(f.nodes[0]) + " " +
+                     std::to_string(f.nodes[1]) + " " + std::to_string(f.nodes[2]) +
                      " is no face of the mesh, or there twice; use the file as meccano wrote it");
 }
 
@@ -1758,17 +1774,15 @@ void readNodes(const VtkFile& file, Mesh& M, const Scanner& in) {
 
 /// The triangles of a file without a meccano by its array `surface`, where that is one of labels.
 void labelPlain(const VtkFile& file, Mesh& M) {
-  constexpr int triangle = 5;
   const auto found = file.cellData.find("surface");
-  if (found == file.cellData.end() || found->second.components != 1) return;
+  if (found == file.cellData.end() || found->second.values.size() != file.types.size()) return;
   MeshFile labelled;
   std::vector<TaggedFace> faces;
   for (std::size_t c = 0; c < file.types.size(); ++c) {
     const double label = std::abs(found->second.values[c]);
     const bool good = label >= 1 && label < INT_MAX && label == std::floor(label);
-    const int* n = &file.nodes[file.start[c]];
-    if (good && file.types[c] == triangle && file.start[c + 1] - file.start[c] == 3)
-      faces.push_back({{n[0], n[1], n[2]}, static_cast<int>(label)});
+    if (good && isTriangle(file, c))
+      faces.push_back({cornersOf(file, c), static_cast<int>(label)});
   }
   std::swap(labelled.M, M);
   labelByTags(labelled, faces);
@@ -2201,6 +2215,12 @@ std::string listText(const std::string& head, const TriangleSurface& S) {
   return out.take();
 }
 
+/// The nearest float. Volatile: g++ 12 -O2 drops the rounding of double(float(v)) in pairs.
+float nearestFloat(double v) {
+  volatile float f = static_cast<float>(v);
+  return f;
+}
+
 void putLittleEndian(std::string& text, std::uint32_t value, int bytes) {
   for (int i = 0; i < bytes; ++i) text += static_cast<char>(value >> 8 * i & 255);
 }
@@ -2215,7 +2235,7 @@ std::string stlText(const TriangleSurface& S) {
     const double length = norm(normal);
     for (Vec3 x : {length > 0 ? (1 / length) * normal : Vec3{}, a, b, c})
       for (double v : {x.x, x.y, x.z}) {
-        const float f = static_cast<float>(v);
+        const float f = nearestFloat(v);
         std::uint32_t bits = 0;
         std::memcpy(&bits, &f, 4);
         putLittleEndian(text, bits, 4);
@@ -2245,7 +2265,7 @@ std::string surfaceText(const std::string& path, const std::vector<TriangleSurfa
                     S);
   double change = 0;
   for (Vec3 x : S.points)
-    for (double v : {x.x, x.y, x.z}) change = std::max(change, std::abs(v - double(float(v))));
+    for (double v : {x.x, x.y, x.z}) change = std::max(change, std::abs(v - nearestFloat(v)));
   if (!std::isfinite(change)) fail(path + ": a coordinate is too large for STL; write .obj or .ts");
   if (change > 0)
     warnings.push_back(path + ": STL has single precision, coordinates change by up to " +
