@@ -5875,9 +5875,13 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
 }
 
+/// [choice] Of l_c: a Hausdorff distance S_M - S that is warned of; and what such a way's lowest q
+/// counts when ways are compared.
+constexpr double poorHausdorff = .3, poorWorth = .6;
+
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
-  constexpr double poorHausdorff = .3, badHausdorff = .5;  // [choice] of l_c: warned of, refused
+  constexpr double badHausdorff = .5;  // [choice] of l_c: refused
   constexpr double poorShift = 2;                          // [choice] of h: warned of
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
@@ -5901,6 +5905,8 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
   try {
     insertOnWay(I, way, trial, ofThisWay);
     measureSurface(trial, I.S, ofThisWay);
+    I.progress("S_M: Hausdorff distance " + number(ofThisWay.hausdorff) + ", " +
+               number(ofThisWay.hausdorff / lc) + " l_c");
     judgeSurface(I.Q.h, ofThisWay);
   } catch (const MethodError& error) {
     I.leave(describe(way), error);
@@ -5910,7 +5916,8 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
     return;
   }
   // beside earlier surfaces the lowest q may be theirs, on every way
-  const double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
+  double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
+  if (ofThisWay.hausdorff > poorHausdorff * lc) lowest *= poorWorth;
   if (report.surface == 0 || lowest > I.lowest)
     report = ofThisWay, result = std::move(trial), I.lowest = lowest;
 }

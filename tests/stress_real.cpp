@@ -33,7 +33,7 @@ enum class Order { asListed, reversed, largestFirst };
 /// What a row must reach; 0 asks for nothing but a valid mesh.
 struct Figures {
   double min = 0, mean = 0;
-  double hausdorff = 0;  // at most, of l_c
+  double hausdorff = 0;  // at most, of the row's l_c
   double shift = 0;      // tangential, at most, of h
 };
 
@@ -152,7 +152,7 @@ std::string missed(const Row& row, const Mesh& M, const std::vector<InsertReport
     const bool isCoyote = M.surfaces[r.surface - 1].name.find("PHTS-COYT") != std::string::npos;
     const double hausdorff = isCoyote ? .3 : row.figures.hausdorff;  // its lobes overlap
     if (row.figures.hausdorff > 0)
-      demand(r.hausdorff <= hausdorff * r.lc, format("H/lc %.2f", r.hausdorff / r.lc));
+      demand(r.hausdorff <= hausdorff * row.lc, format("H/lc %.2f", r.hausdorff / row.lc));
     if (row.figures.shift > 0)
       demand(r.tangentialShift <= row.figures.shift * h,
              format("shift/h %.2f", r.tangentialShift / h));
