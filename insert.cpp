@@ -6088,14 +6088,14 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
     if (I.ways > waysBefore || !I.isBlocked) ++tries;
     lc /= 2;
   }
-  const Nearest nearest = wasBlocked ? nearestEarlier(M, cleaned) : Nearest{"", 0};
+  const Nearest nearest = report.lc < options.lc ? nearestEarlier(M, cleaned) : Nearest{"", 0};
   if (report.surface == 0)
     throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
                       " nor down to " + number(2 * lc) + ", after " + std::to_string(I.faults) +
                       " tries, the last because " + I.reason +
-                      (wasBlocked ? "; " + nearest.text + ": lower l_c to " +
-                                        number(.5 * nearest.distance)
-                                  : "; lower l_c"));
+                      (nearest.distance < options.lc ? "; " + nearest.text + ": lower l_c to " +
+                                                           number(.5 * nearest.distance)
+                                                     : "; lower l_c"));
   std::vector<std::string> warnings = candidate.warnings;
   if (report.lc < options.lc)
     warnings.push_back("l_c was lowered from " + number(options.lc) + " to " + number(report.lc) +
