@@ -1615,18 +1615,27 @@ void addPatches(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi)
     Pi.rectangles.push_back({R.lo, R.hi, R.axis, R.side});
     Pi.patches.push_back(P);
   }
-  std::vector<std::map<int, int>> pointOf(B.regions.size());  // of the solid's points
-  for (const LatticeRectangle& R : B.rectangles) {
+  std::vector<int> pointOf(D.points.size()), patchOf(D.points.size(), -1);
+  std::vector<int> byRegion(B.rectangles.size());
+  std::iota(byRegion.begin(), byRegion.end(), 0);
+  std::stable_sort(byRegion.begin(), byRegion.end(), [&](int a, int b) {
+    return B.rectangles[a].region < B.rectangles[b].region;
+  });
+  for (int r : byRegion) {
+    const LatticeRectangle& R = B.rectangles[r];
     Parametrization& P = Pi.patches[R.region];
     const BoundaryMapping::Rectangle& place = Pi.rectangles[R.region];
     Disk disk = diskAt(D, triangleLeftOf(D, R.rim[0]));
     flatten(disk, [&](int h, double part) { return inRectangle(place, latticeAt(B, h, part)); });
     for (std::array<int, 3> t : disk.triangles) {
       for (int& n : t) {
-        const auto [it, isNew] =
-            pointOf[R.region].insert({disk.vertex[n], static_cast<int>(P.points.size())});
-        if (isNew) P.points.push_back(disk.points[n]), P.u.push_back(disk.u[n]);
-        n = it->second;
+        const int vertex = disk.vertex[n];
+        if (std::exchange(patchOf[vertex], R.region) != R.region) {
+          pointOf[vertex] = static_cast<int>(P.points.size());
+          P.points.push_back(disk.points[n]);
+          P.u.push_back(disk.u[n]);
+        }
+        n = pointOf[vertex];
       }
       if (R.side == 0) std::swap(t[1], t[2]);
       P.triangles.push_back(t);
@@ -1696,14 +1705,15 @@ BoundaryMapping mappingOf(const MeccanoSurface& B, const CutSolid& D) {
 
 /// A way to cut the solid, and how good its mapping is.
 struct Attempt {
+  CutSolid D;
   BoundaryMapping Pi;
-  int inverted = 0;
-  double mean = -1;  // of q; -1: none yet
+  double mean;  // of q; -1: none yet
 };
 
-/// Keeps the better mapping: fewer inverted elements after the first placement of the interior on
-/// the meccano's mesh refined a few times, then the higher mean quality.
-void keepBetter(const Meccano& C, BoundaryMapping Pi, const std::string& way, Attempt& best) {
+/// Mean q after the first placement of the interior, on the meccano's mesh refined a few times.
+/// [choice] An inverted element counts 0: fewest inverted elements alone, on a mesh as coarse as
+/// this, chose maps that ended with lower quality.
+double meanQuality(const Meccano& C, const BoundaryMapping& Pi, std::string& text) {
   constexpr std::size_t enough = 2500;  // [choice] elements that tell mappings apart
   Mesh M = getInitialMesh(C, Pi);
   while (M.tets.size() < enough) {
@@ -1713,39 +1723,77 @@ void keepBetter(const Meccano& C, BoundaryMapping Pi, const std::string& way, At
   }
   placeInterior(M);
   const QualityStatistics q = qualityStatistics(M);
-  const bool better = best.mean < 0 || q.inverted < best.inverted ||
-                      (q.inverted == best.inverted && q.mean > best.mean);
-  std::vector<std::string> notes = std::move(best.Pi.notes);
-  notes.push_back("§2: " + way + ": " + std::to_string(q.inverted) + " of " +
-                  std::to_string(q.tetrahedra) + " elements inverted, mean q " + number(q.mean));
-  if (better) {
-    best.Pi = std::move(Pi);
-    best.inverted = q.inverted;
-    best.mean = q.mean;
-  }
-  best.Pi.notes = std::move(notes);
+  text = std::to_string(q.inverted) + " of " + std::to_string(q.tetrahedra) +
+         " elements inverted, mean q " + number(q.mean);
+  return q.mean;
 }
 
-/// From corners that are placed: paths as they are, drawn straight, corners relaxed and then drawn
-/// straight.
-void tryPaths(const MeccanoSurface& B, const Meccano& C, CutSolid D, const std::string& way,
+/// Keeps the better of the best attempt and of this one.
+///   returns mean q of this one
+double keepBetter(const MeccanoSurface& B, const Meccano& C, CutSolid D, const std::string& way,
+                  Attempt& best) {
+  D.separatePaths();
+  BoundaryMapping Pi = mappingOf(B, D);
+  std::string text;
+  const double mean = meanQuality(C, Pi, text);
+  Pi.notes = std::move(best.Pi.notes);
+  Pi.notes.push_back("§2: " + way + ": " + text);
+  if (mean > best.mean)
+    best = {std::move(D), std::move(Pi), mean};
+  else
+    best.Pi.notes = std::move(Pi.notes);
+  return mean;
+}
+
+/// [choice] Mean q of shortest paths from which a meccano fits the solid: its corners stay. And of
+/// any mapping from which no further start is tried.
+constexpr double goodFit = .8;
+
+/// From corners that are placed: the shortest paths, and where the meccano does not fit so, with the
+/// corners relaxed.
+void tryStart(const MeccanoSurface& B, const Meccano& C, CutSolid D, const std::string& way,
               Attempt& best) {
   placeCutEnds(B, D);
   std::vector<int> chains(B.chains.size());
   std::iota(chains.begin(), chains.end(), 0);
   tracePaths(B, D, chains);
-  auto straighten = [&](CutSolid& S) {
-    for (int c : chains) straightenChain(B, S, c);
-    S.separatePaths();
-    return mappingOf(B, S);
-  };
-  CutSolid raw = D;
-  raw.separatePaths();
-  keepBetter(C, mappingOf(B, raw), way + ", shortest paths", best);
-  CutSolid straight = D;
-  keepBetter(C, straighten(straight), way + ", straightened", best);
+  if (keepBetter(B, C, D, way, best) > goodFit) return;
   for (int n = 0; n < static_cast<int>(B.nodes.size()); ++n) relaxNode(B, D, n);
-  keepBetter(C, straighten(D), way + ", relaxed and straightened", best);
+  keepBetter(B, C, std::move(D), way + ", relaxed", best);
+}
+
+/// All starts until one fits well.
+void tryStarts(const MeccanoSurface& B, const Meccano& C, const TriangleSurface& D,
+               const CutSolid& uncut, Attempt& best) {
+  std::string fault;
+  std::set<std::vector<int>> tried;  // places of the corners
+  for (int k = 0; k < 4 && best.mean < goodFit; ++k) {
+    CutSolid S = uncut;
+    const bool principal = k >= 2;
+    const Start start = k % 2 == 0 ? Start::extremes : Start::boxCorners;
+    const std::string way =
+        std::string(start == Start::extremes ? "extreme vertices" : "box corners") +
+        (principal ? " along principal axes" : "");
+    try {
+      placeCorners(B, principal ? principalFrame(D) : coordinateFrame(D), start, S);
+      if (tried.insert(S.node).second) tryStart(B, C, std::move(S), way, best);
+    } catch (const MethodError& e) {
+      fault = e.what();
+      best.Pi.notes.push_back("§2: " + way + ": " + fault);
+    }
+  }
+  if (best.mean < 0) throw MethodError(fault);
+}
+
+/// The best cuts, drawn straight, if that is better still.
+void straighten(const MeccanoSurface& B, const Meccano& C, Attempt& best) {
+  try {
+    CutSolid D = best.D;
+    for (int c = 0; c < static_cast<int>(B.chains.size()); ++c) straightenChain(B, D, c);
+    keepBetter(B, C, std::move(D), "straightened", best);
+  } catch (const MethodError& e) {
+    best.Pi.notes.push_back(std::string("§2: straightened: ") + e.what());
+  }
 }
 
 }  // namespace
@@ -1760,33 +1808,17 @@ BoundaryMapping getBoundaryMapping(const Meccano& C, const TriangleSurface& D) {
     refuseMeccano("the solid has " + counted(genus, "handle") +
                   ", which needs the places of the polycube's corners; add a line `corner i j k x y "
                   "z` for each");
-  CutSolid start(D);
-  start.node.assign(B.nodes.size(), -1);
-  start.path.resize(B.chains.size());
-  Attempt best;
-  if (!C.corners.empty()) {
-    placeCorners(B, C, start);
-    tryPaths(B, C, start, "placed corners", best);
-    return best.Pi;
+  CutSolid uncut(D);
+  uncut.node.assign(B.nodes.size(), -1);
+  uncut.path.resize(B.chains.size());
+  Attempt best{uncut, {}, -1};
+  if (C.corners.empty()) {
+    tryStarts(B, C, D, uncut, best);
+  } else {
+    placeCorners(B, C, uncut);
+    tryStart(B, C, uncut, "placed corners", best);
   }
-  std::string fault;
-  std::set<std::vector<int>> tried;
-  for (int k = 0; k < 4; ++k) {
-    CutSolid S = start;
-    const Start kind = k % 2 == 0 ? Start::boxCorners : Start::extremes;
-    try {
-      placeCorners(B, k < 2 ? coordinateFrame(D) : principalFrame(D), kind, S);
-      if (!tried.insert(S.node).second) continue;
-      tryPaths(B, C, std::move(S),
-               std::string(kind == Start::extremes ? "extreme vertices" : "box corners") +
-                   (k < 2 ? "" : " along principal axes"),
-               best);
-    } catch (const MethodError& e) {
-      fault = e.what();
-      best.Pi.notes.push_back(fault);
-    }
-  }
-  if (best.mean < 0) throw MethodError(fault);
+  straighten(B, C, best);
   return best.Pi;
 }
 
