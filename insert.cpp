@@ -2856,18 +2856,23 @@ int refineToDistance(Mesher& W, double eps) {
 /// Untangles with the boundary fixed, [departure] and where a few elements stay inverted, bisects
 /// them for more freedom. Returns the number of inverted elements left.
 int untangleFixed(Mesher& W, bool smooth) {
-  constexpr int maxRounds = 8;
+  constexpr int maxRounds = 10, patience = 2;  // rounds without fewer inverted elements
   OptimizeOptions optimize = W.options.optimize;
   optimize.starDelta = true;
   optimize.globalDescent = false;
   if (!smooth) optimize.power = 1;
-  int fewest = static_cast<int>(W.M.tets.size()) + 1;
+  int fewest = static_cast<int>(W.M.tets.size()) + 1, waited = 0;
+  for (int k = 0; k < maxRounds; ++k) {
+    Bisection B(W.M);
+    if (splitFlatCorners(B) == 0) break;
+  }
   for (int round = 0;; ++round) {
     optimize.fixed = boundaryNodes(W.M);
     const int inverted = optimizeMesh(W.M, optimize).inverted;
     W.progress("fixed boundary: " + sizeText(W.M) + ", " + std::to_string(inverted) + " inverted");
-    if (inverted == 0 || inverted >= fewest || round == maxRounds) return inverted;
-    fewest = inverted;
+    if (inverted >= fewest) ++waited;
+    if (inverted == 0 || waited == patience || round == maxRounds) return inverted;
+    fewest = std::min(fewest, inverted);
     Bisection B(W.M);
     const std::vector<double> q = qualities(W.M);
     for (std::size_t E = 0; E < q.size(); ++E)
@@ -2891,11 +2896,9 @@ double movedFaceDistance(const Mesh& M, const BoundaryFace& face, double enough)
   return most;
 }
 
-constexpr double guardedEps = .8;  // [choice] of ε: farther faces must not get worse by sliding
-
-/// Algorithm 2 on all nodes; a boundary node is not moved where a face beside it gets worse than
-/// the guard allows.
-OptimizeReport slideWithin(Mesher& W, double eps) {
+/// Algorithm 2 on all nodes; a boundary node is not moved where a face beside it gets farther than
+/// allowed and worse.
+OptimizeReport slideWithin(Mesher& W, double allowed, bool last) {
   Mesh& M = W.M;
   std::vector<std::vector<BoundaryTriangle>> facesAt(M.x.size());
   for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
@@ -2904,15 +2907,15 @@ OptimizeReport slideWithin(Mesher& W, double eps) {
         for (int j = 1; j < 4; ++j) facesAt[M.tets[E][(i + j) % 4]].push_back({E, i});
   OptimizeOptions optimize = W.options.optimize;
   optimize.globalDescent = false;
-  const double allowed = guardedEps * eps;
+  optimize.starDelta = true;
+  if (!last) optimize.power = 1;
   optimize.accept = [&](int n, Vec3 x, Vec2 parameter) {
     bool good = true;
     for (const BoundaryTriangle& at : facesAt[n]) {
-      const double before = movedFaceDistance(M, boundaryFace(M, at), allowed);
       std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
       const double after = movedFaceDistance(M, boundaryFace(M, at), allowed);
       std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
-      good = after <= allowed || after < before;
+      good = after <= allowed || after < movedFaceDistance(M, boundaryFace(M, at), allowed);
       if (!good) break;
     }
     return good;
@@ -2920,15 +2923,14 @@ OptimizeReport slideWithin(Mesher& W, double eps) {
   return optimizeMesh(M, optimize);
 }
 
+/// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide far,
+/// and what they leave is refined; in the end hardly any face exceeds ε.
+constexpr double guard[] = {3, 1.5, .8, .8, .8, .8};
+
 /// qualityOptimization with ∂Ω prepared.
 void optimizeQuality(Mesher& W) {
-  constexpr int maxRounds = 6;
   const double eps = sampledEps * W.options.eps;
   placeInterior(W.M);
-  for (int k = 0; k < maxRounds; ++k) {
-    Bisection B(W.M);
-    if (splitFlatCorners(B) == 0) break;
-  }
   if (const int left = untangleFixed(W, W.options.fixedBoundary); left > 0)
     throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
                       " elements stay inverted with the boundary fixed; lower eps, or give a "
@@ -2937,24 +2939,27 @@ void optimizeQuality(Mesher& W) {
   W.report.untangled = qualityStatistics(W.M);
   W.stage("untangled");
   if (W.options.fixedBoundary) return;
+  constexpr int fewInverted = 60;
   Mesh valid = W.M;
   double best = 0;
-  for (int round = 1; round <= maxRounds; ++round) {
-    const OptimizeReport o = slideWithin(W, eps);
+  const int rounds = static_cast<int>(std::size(guard));
+  for (int round = 1; round <= rounds; ++round) {
+    const bool last = guard[round - 1] < 1;
+    const OptimizeReport o = slideWithin(W, guard[round - 1] * eps, last);
     const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
     W.progress("round " + std::to_string(round) + ": " + sizeText(W.M) + ", min " +
                number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " +
                number(d.largest()) + ", " + std::to_string(o.inverted) + " inverted");
-    if (o.inverted == 0 && d.largest() <= eps && o.minQ > best) {
-      best = o.minQ, valid = W.M, W.report.rounds = round;
-      break;
+    const bool within = d.largest() <= eps;
+    if (!within) refineToDistance(W, eps);
+    if (!within || o.inverted > 0) {
+      // a few that stay are left to the next round, whose boundary slides
+      if (untangleFixed(W, false) > fewInverted) break;
     }
-    if (o.inverted > 0) break;
-    refineToDistance(W, eps);
-    if (untangleFixed(W, false) > 0) break;
     const QualityStatistics q = qualityStatistics(W.M);
-    if (q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
+    if (q.inverted == 0 && q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
       best = q.min, valid = W.M, W.report.rounds = round;
+    if (within && last && q.inverted == 0) break;
   }
   W.M = std::move(valid);
 }
