@@ -1225,8 +1225,7 @@ void relaxNode(const MeccanoSurface& B, CutSolid& D, int node) {
 
   D.separatePaths();
   const int seed = triangleLeftOf(D, spokes[0]);
-  std::vector<std::vector<int>> old;
-  for (int h : spokes) old.push_back(D.path[h / 2]), D.clearPath(h / 2);
+  for (int h : spokes) D.clearPath(h / 2);
   D.onPath[D.node[node]] = 0;
   Disk P = diskAt(D, seed);
   flatten(P, rim);
@@ -1238,6 +1237,41 @@ void relaxNode(const MeccanoSurface& B, CutSolid& D, int node) {
   std::vector<int> chains;
   for (int h : spokes) chains.push_back(h / 2);
   tracePaths(B, D, chains);
+}
+
+/// Cuts a flattened disk along the line u.x = 0: near points are taken for it, other edges that
+/// cross it are split.
+///   returns the points on the line, 1 for each; points of D that are not: 0
+std::vector<char> splitAlongMiddle(CutSolid& D, const Disk& P) {
+  constexpr double snap = .1;      // [choice] part of an edge within which its end is taken
+  constexpr double onLine = 1e-9;  // of a cube's edge: rounding
+  std::vector<double> x;
+  for (const Vec2& u : P.u) x.push_back(std::abs(u.x) < onLine ? 0 : u.x);
+  auto crossing = [&](int a, int b) { return x[a] * x[b] < 0 ? x[a] / (x[a] - x[b]) : -1; };
+  for (const std::array<int, 3>& t : P.triangles)
+    for (int i = 0; i < 3; ++i) {
+      const int a = t[i], b = t[(i + 1) % 3];
+      const double part = crossing(a, b);
+      if (part >= 0 && part < snap && !P.isRim[a]) x[a] = 0;
+      if (part > 1 - snap && !P.isRim[b]) x[b] = 0;
+    }
+  std::vector<char> onMiddle(D.points.size(), 0);
+  for (std::size_t n = 0; n < x.size(); ++n)
+    if (x[n] == 0) onMiddle[P.vertex[n]] = 1;
+  for (std::size_t l = 0; l < P.triangles.size(); ++l)
+    for (int i = 0; i < 3; ++i) {
+      const int a = P.triangles[l][i], b = P.triangles[l][(i + 1) % 3];
+      const double part = crossing(a, b);
+      if (part < 0 || P.vertex[a] > P.vertex[b]) continue;  // each inner edge once
+      int t0 = -1, i0 = -1;
+      D.aroundPoint(P.vertex[a], [&](int t, int j) {
+        if (D.triangles[t][(j + 1) % 3] == P.vertex[b] && D.halfChain[t][j] == 0) t0 = t, i0 = j;
+      });
+      if (t0 < 0) continue;  // along the rim
+      D.splitEdge(t0, i0, std::clamp(part, snap, 1 - snap));
+      onMiddle.push_back(1);
+    }
+  return onMiddle;
 }
 
 /// [choice] Draws a chain straight: the two patches beside it are mapped onto a 2 x 1 rectangle and
@@ -1264,46 +1298,11 @@ void straightenChain(const MeccanoSurface& B, CutSolid& D, int c) {
   }
   D.separatePaths();
   const int seed = triangleLeftOf(D, 2 * c);
-  const std::vector<int> old = D.path[c];
   D.clearPath(c);
   Disk P = diskAt(D, seed);
   flatten(P, rim);
 
-  // Points of the middle line: near ones are taken for it, crossed edges are split.
-  constexpr double snap = .1;     // [choice] part of an edge within which its end is taken
-  constexpr double onLine = 1e-9; // of the rectangle's width: rounding
-  std::vector<double> x(P.u.size());
-  std::vector<char> usable(D.points.size(), 0);
-  for (std::size_t n = 0; n < x.size(); ++n) {
-    x[n] = P.u[n].x;
-    if (!P.isRim[n] && std::abs(x[n]) < onLine) x[n] = 0;
-    if (P.vertex[n] == old.front() || P.vertex[n] == old.back()) x[n] = P.isRim[n] && std::abs(x[n]) < onLine ? 0 : x[n];
-  }
-  auto crossing = [&](int a, int b) { return x[a] * x[b] < 0 ? x[a] / (x[a] - x[b]) : -1; };
-  for (const std::array<int, 3>& t : P.triangles)
-    for (int i = 0; i < 3; ++i) {
-      const int a = t[i], b = t[(i + 1) % 3];
-      const double part = crossing(a, b);
-      if (part >= 0 && part < snap && !P.isRim[a]) x[a] = 0;
-      if (part > 1 - snap && !P.isRim[b]) x[b] = 0;
-    }
-  for (std::size_t n = 0; n < x.size(); ++n)
-    if (x[n] == 0) usable[P.vertex[n]] = 1;
-  std::map<std::pair<int, int>, double> crossed;  // edges of the solid, lower point first
-  for (const std::array<int, 3>& t : P.triangles)
-    for (int i = 0; i < 3; ++i) {
-      const int a = t[i], b = t[(i + 1) % 3];
-      if (crossing(a, b) >= 0 && P.vertex[a] < P.vertex[b])
-        crossed[{P.vertex[a], P.vertex[b]}] = std::clamp(crossing(a, b), snap, 1 - snap);
-    }
-  for (const auto& [edge, part] : crossed) {
-    int t0 = -1, i0 = -1;
-    D.aroundPoint(edge.first, [&, b = edge.second](int t, int i) {
-      if (D.triangles[t][(i + 1) % 3] == b && D.halfChain[t][i] == 0) t0 = t, i0 = i;
-    });
-    if (t0 >= 0) D.splitEdge(t0, i0, part), usable.push_back(1);
-  }
-  if (tracePath(B, D, c, usable)) return;
+  if (tracePath(B, D, c, splitAlongMiddle(D, P))) return;
   tracePaths(B, D, {c});
 }
 
@@ -1556,16 +1555,16 @@ void placeCutEnds(const MeccanoSurface& B, CutSolid& D) {
   }
 }
 
-/// Position along a half-chain in the lattice.
-Vec3 latticeAt(const MeccanoSurface& B, int h, double part) {
-  const Vec3 a = latticeVector(B.start(h)), b = latticeVector(B.start(h ^ 1));
-  return a + part * (b - a);
-}
-
 Vec2 inRectangle(const BoundaryMapping::Rectangle& R, Vec3 p) {
   const int u = (R.axis + 1) % 3, v = (R.axis + 2) % 3;
   return {(component(p, u) - R.lo[u]) / (R.hi[u] - R.lo[u]),
           (component(p, v) - R.lo[v]) / (R.hi[v] - R.lo[v])};
+}
+
+/// u at this part of a half-chain.
+Vec2 inRectangle(const BoundaryMapping::Rectangle& R, const MeccanoSurface& B, int h, double part) {
+  const Vec2 a = inRectangle(R, latticeVector(B.start(h)));
+  return a + part * (inRectangle(R, latticeVector(B.start(h ^ 1))) - a);
 }
 
 /// Each rectangle by Floater onto its place; those of one flat region are one patch.
@@ -1590,7 +1589,7 @@ void addPatches(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi)
     Parametrization& P = Pi.patches[R.region];
     const BoundaryMapping::Rectangle& place = Pi.rectangles[R.region];
     Disk disk = diskAt(D, triangleLeftOf(D, R.rim[0]));
-    flatten(disk, [&](int h, double part) { return inRectangle(place, latticeAt(B, h, part)); });
+    flatten(disk, [&](int h, double part) { return inRectangle(place, B, h, part); });
     for (std::array<int, 3> t : disk.triangles) {
       for (int& n : t) {
         const int vertex = disk.vertex[n];
@@ -1635,12 +1634,12 @@ void addCurves(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) 
     while (B.start(h)[axis] == B.start(h ^ 1)[axis]) ++axis;
     if (B.regions[regions[0]].axis != (axis + 1) % 3) std::swap(regions[0], regions[1]);
     for (int r : regions) C.sides.push_back({-(r + 1), {}});
-    auto add = [&](int point, Vec3 xi) {
+    auto add = [&](int point, int g, double part) {
       const double step = C.points.empty() ? 0 : norm(D.points[point] - C.points.back());
       C.s.push_back(C.s.empty() ? 0 : C.s.back() + step);
       C.points.push_back(D.points[point]);
       for (int i = 0; i < 2; ++i)
-        C.sides[i].u.push_back(inRectangle(Pi.rectangles[regions[i]], xi));
+        C.sides[i].u.push_back(inRectangle(Pi.rectangles[regions[i]], B, g, part));
     };
     int last = h;
     for (int g = h; g >= 0; last = g, g = straightOn(B, g)) {
@@ -1649,9 +1648,9 @@ void addCurves(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) 
       for (std::size_t k = 1; k < path.size(); ++k)
         s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
       for (std::size_t k = 0; k + 1 < path.size(); ++k)
-        add(path[k], latticeAt(B, g, s[k] / s.back()));
+        add(path[k], g, s[k] / s.back());
     }
-    add(D.node[B.startNode(last ^ 1)], latticeVector(B.start(last ^ 1)));
+    add(D.node[B.startNode(last ^ 1)], last ^ 1, 0);
     Pi.curves.push_back(C);
     Pi.segments.push_back({B.start(h), B.start(last ^ 1)});
     const int number = static_cast<int>(Pi.curves.size());
@@ -1865,71 +1864,83 @@ Mesh getInitialMesh(const Meccano& C, const BoundaryMapping& Pi) {
   return M;
 }
 
-void placeInterior(Mesh& M) {
-  const std::size_t nodes = M.x.size();
-  std::vector<char> isInner(nodes);
-  for (std::size_t n = 0; n < nodes; ++n) isInner[n] = M.dimension[n] == 3;
-  // Stiffness of linear elements: ∫ ∇λ_i · ∇λ_j, without the diagonal (rows sum to 0).
+namespace {
+
+/// Stiffness of linear elements in ξ, ∫ ∇λ_i · ∇λ_j, at the inner nodes of a mesh.
+struct Stiffness {
   struct Element {
     std::array<int, 4> z;
     double k[4][4];
   };
   std::vector<Element> elements;
-  std::vector<double> diagonal(nodes, 0.0);
-  for (const std::array<int, 4>& z : M.tets) {
-    if (!(isInner[z[0]] || isInner[z[1]] || isInner[z[2]] || isInner[z[3]])) continue;
-    Element E{z, {}};
-    const Mat3 edges{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]};
-    const Mat3 cof = cofactor(edges);
-    const Vec3 g[4] = {-(cof.c0 + cof.c1 + cof.c2), cof.c0, cof.c1, cof.c2};
-    for (int i = 0; i < 4; ++i)
-      for (int j = 0; j < 4; ++j)
-        if (i != j) {
+  std::vector<char> isInner;
+  std::vector<double> diagonal;
+
+  explicit Stiffness(const Mesh& M) : isInner(M.x.size()), diagonal(M.x.size(), 0) {
+    for (std::size_t n = 0; n < M.x.size(); ++n) isInner[n] = M.dimension[n] == 3;
+    for (const std::array<int, 4>& z : M.tets) {
+      if (!(isInner[z[0]] || isInner[z[1]] || isInner[z[2]] || isInner[z[3]])) continue;
+      Element E{z, {}};
+      const Mat3 edges{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]};
+      const Mat3 cof = cofactor(edges);
+      const Vec3 g[4] = {-(cof.c0 + cof.c1 + cof.c2), cof.c0, cof.c1, cof.c2};
+      for (int i = 0; i < 4; ++i)
+        for (int j = 0; j < 4; ++j) {
+          if (i == j) continue;
           E.k[i][j] = dot(g[i], g[j]) / (6 * std::abs(det(edges)));
-          diagonal[z[i]] -= E.k[i][j];
+          diagonal[z[i]] -= E.k[i][j];  // rows sum to 0
         }
-    elements.push_back(E);
+      elements.push_back(E);
+    }
   }
-  using Field = std::vector<Vec3>;
-  auto product = [&](const Field& p) {
-    Field y(nodes);
+  /// Of the stiffness matrix with a field; 0 at the other nodes.
+  std::vector<Vec3> product(const std::vector<Vec3>& p) const {
+    std::vector<Vec3> y(p.size());
     for (const Element& E : elements)
       for (int i = 0; i < 4; ++i)
         for (int j = 0; j < 4; ++j)
-          if (i != j) y[E.z[i]] += E.k[i][j] * (p[E.z[j]] - p[E.z[i]]);
-    for (std::size_t n = 0; n < nodes; ++n)
-      if (!isInner[n]) y[n] = {};
+          if (i != j && isInner[E.z[i]]) y[E.z[i]] += E.k[i][j] * (p[E.z[j]] - p[E.z[i]]);
     return y;
-  };
-  auto inner = [&](const Field& a, const Field& b) {
-    double sum = 0;
-    for (std::size_t n = 0; n < nodes; ++n) sum += dot(a[n], b[n]);
-    return sum;
-  };
-  auto scaled = [&](Field r) {  // by the diagonal
-    for (std::size_t n = 0; n < nodes; ++n)
-      if (isInner[n]) r[n] = (1 / diagonal[n]) * r[n];
-    return r;
-  };
-  // Conjugate gradients for the three coordinates at once.
+  }
+};
+
+double innerProduct(const std::vector<Vec3>& a, const std::vector<Vec3>& b) {
+  double sum = 0;
+  for (std::size_t n = 0; n < a.size(); ++n) sum += dot(a[n], b[n]);
+  return sum;
+}
+
+}  // namespace
+
+void placeInterior(Mesh& M) {
   constexpr double tolerance = 1e-10;  // of the first residual's norm: far below any element
   constexpr int maxIterations = 5000;
-  Field r = product(M.x);
+  const Stiffness K(M);
+  auto scaled = [&](std::vector<Vec3> r) {
+    for (std::size_t n = 0; n < r.size(); ++n)
+      if (K.isInner[n]) r[n] = (1 / K.diagonal[n]) * r[n];
+    return r;
+  };
+  // Conjugate gradients with the diagonal as preconditioner, for the three coordinates at once.
+  std::vector<Vec3> r = K.product(M.x);
   for (Vec3& v : r) v = -v;
-  Field z = scaled(r), p = z;
-  double rz = inner(r, z);
+  std::vector<Vec3> z = scaled(r), p = z;
+  double rz = innerProduct(r, z);
   const double goal = tolerance * tolerance * rz;
   for (int iteration = 0; rz > goal; ++iteration) {
     if (iteration == maxIterations)
       throw SolverError("placeInterior (§2): conjugate gradients did not reach " +
                         number(tolerance) + " in " + std::to_string(maxIterations) +
                         " iterations; the mesh's computational elements are degenerate");
-    const Field Ap = product(p);
-    const double alpha = rz / inner(p, Ap);
-    for (std::size_t n = 0; n < nodes; ++n) M.x[n] += alpha * p[n], r[n] += -alpha * Ap[n];
+    const std::vector<Vec3> Kp = K.product(p);
+    const double alpha = rz / innerProduct(p, Kp);
+    for (std::size_t n = 0; n < p.size(); ++n) {
+      M.x[n] += alpha * p[n];
+      r[n] += -alpha * Kp[n];
+    }
     z = scaled(r);
-    const double next = inner(r, z), beta = next / rz;
-    for (std::size_t n = 0; n < nodes; ++n) p[n] = z[n] + beta * p[n];
+    const double next = innerProduct(r, z);
+    for (std::size_t n = 0; n < p.size(); ++n) p[n] = z[n] + (next / rz) * p[n];
     rz = next;
   }
 }
