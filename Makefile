@@ -3,6 +3,7 @@
 # make demo       Figure 8, beside Table I      make audit   equation -> function -> test
 # make asan       the tests with sanitizers     make stress  200 random surfaces
 # make bench      time of each stage            make samples samples/ anew from its generator
+# make stress-real  the surfaces of ../shared/data, where it is
 CXX      ?= g++
 CXXFLAGS ?= -O2 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-sign-conversion
 EXTRA    ?=
@@ -64,9 +65,11 @@ audit:
 	@sh tests/audit.sh
 stress bench: %: $(BUILD)/tests/%
 	$(BUILD)/tests/$@ $(ARGS)
+stress-real: $(BUILD)/tests/stress_real
+	$< $(ARGS)
 clean:
 	rm -rf $(BUILD) $(PROGRAM)
 
-.PHONY: all demo test audit asan stress bench samples clean
+.PHONY: all demo test audit asan stress stress-real bench samples clean
 .SECONDARY:
 -include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d)

@@ -1261,8 +1261,7 @@ void relaxNode(const MeccanoSurface& B, CutSolid& D, int node) {
 
   D.separatePaths();
   const int seed = triangleLeftOf(D, spokes[0]);
-  std::vector<std::vector<int>> old;
-  for (int h : spokes) old.push_back(D.path[h / 2]), D.clearPath(h / 2);
+  for (int h : spokes) D.clearPath(h / 2);
   D.onPath[D.node[node]] = 0;
   Disk P = diskAt(D, seed);
   flatten(P, rim);
@@ -1274,6 +1273,41 @@ void relaxNode(const MeccanoSurface& B, CutSolid& D, int node) {
   std::vector<int> chains;
   for (int h : spokes) chains.push_back(h / 2);
   tracePaths(B, D, chains);
+}
+
+/// Cuts a flattened disk along the line u.x = 0: near points are taken for it, other edges that
+/// cross it are split.
+///   returns the points on the line, 1 for each; points of D that are not: 0
+std::vector<char> splitAlongMiddle(CutSolid& D, const Disk& P) {
+  constexpr double snap = .1;      // [choice] part of an edge within which its end is taken
+  constexpr double onLine = 1e-9;  // of a cube's edge: rounding
+  std::vector<double> x;
+  for (const Vec2& u : P.u) x.push_back(std::abs(u.x) < onLine ? 0 : u.x);
+  auto crossing = [&](int a, int b) { return x[a] * x[b] < 0 ? x[a] / (x[a] - x[b]) : -1; };
+  for (const std::array<int, 3>& t : P.triangles)
+    for (int i = 0; i < 3; ++i) {
+      const int a = t[i], b = t[(i + 1) % 3];
+      const double part = crossing(a, b);
+      if (part >= 0 && part < snap && !P.isRim[a]) x[a] = 0;
+      if (part > 1 - snap && !P.isRim[b]) x[b] = 0;
+    }
+  std::vector<char> onMiddle(D.points.size(), 0);
+  for (std::size_t n = 0; n < x.size(); ++n)
+    if (x[n] == 0) onMiddle[P.vertex[n]] = 1;
+  for (std::size_t l = 0; l < P.triangles.size(); ++l)
+    for (int i = 0; i < 3; ++i) {
+      const int a = P.triangles[l][i], b = P.triangles[l][(i + 1) % 3];
+      const double part = crossing(a, b);
+      if (part < 0 || P.vertex[a] > P.vertex[b]) continue;  // each inner edge once
+      int t0 = -1, i0 = -1;
+      D.aroundPoint(P.vertex[a], [&](int t, int j) {
+        if (D.triangles[t][(j + 1) % 3] == P.vertex[b] && D.halfChain[t][j] == 0) t0 = t, i0 = j;
+      });
+      if (t0 < 0) continue;  // along the rim
+      D.splitEdge(t0, i0, std::clamp(part, snap, 1 - snap));
+      onMiddle.push_back(1);
+    }
+  return onMiddle;
 }
 
 /// [choice] Draws a chain straight: the two patches beside it are mapped onto a 2 x 1 rectangle and
@@ -1300,46 +1334,11 @@ void straightenChain(const MeccanoSurface& B, CutSolid& D, int c) {
   }
   D.separatePaths();
   const int seed = triangleLeftOf(D, 2 * c);
-  const std::vector<int> old = D.path[c];
   D.clearPath(c);
   Disk P = diskAt(D, seed);
   flatten(P, rim);
 
-  // Points of the middle line: near ones are taken for it, crossed edges are split.
-  constexpr double snap = .1;     // [choice] part of an edge within which its end is taken
-  constexpr double onLine = 1e-9; // of the rectangle's width: rounding
-  std::vector<double> x(P.u.size());
-  std::vector<char> usable(D.points.size(), 0);
-  for (std::size_t n = 0; n < x.size(); ++n) {
-    x[n] = P.u[n].x;
-    if (!P.isRim[n] && std::abs(x[n]) < onLine) x[n] = 0;
-    if (P.vertex[n] == old.front() || P.vertex[n] == old.back()) x[n] = P.isRim[n] && std::abs(x[n]) < onLine ? 0 : x[n];
-  }
-  auto crossing = [&](int a, int b) { return x[a] * x[b] < 0 ? x[a] / (x[a] - x[b]) : -1; };
-  for (const std::array<int, 3>& t : P.triangles)
-    for (int i = 0; i < 3; ++i) {
-      const int a = t[i], b = t[(i + 1) % 3];
-      const double part = crossing(a, b);
-      if (part >= 0 && part < snap && !P.isRim[a]) x[a] = 0;
-      if (part > 1 - snap && !P.isRim[b]) x[b] = 0;
-    }
-  for (std::size_t n = 0; n < x.size(); ++n)
-    if (x[n] == 0) usable[P.vertex[n]] = 1;
-  std::map<std::pair<int, int>, double> crossed;  // edges of the solid, lower point first
-  for (const std::array<int, 3>& t : P.triangles)
-    for (int i = 0; i < 3; ++i) {
-      const int a = t[i], b = t[(i + 1) % 3];
-      if (crossing(a, b) >= 0 && P.vertex[a] < P.vertex[b])
-        crossed[{P.vertex[a], P.vertex[b]}] = std::clamp(crossing(a, b), snap, 1 - snap);
-    }
-  for (const auto& [edge, part] : crossed) {
-    int t0 = -1, i0 = -1;
-    D.aroundPoint(edge.first, [&, b = edge.second](int t, int i) {
-      if (D.triangles[t][(i + 1) % 3] == b && D.halfChain[t][i] == 0) t0 = t, i0 = i;
-    });
-    if (t0 >= 0) D.splitEdge(t0, i0, part), usable.push_back(1);
-  }
-  if (tracePath(B, D, c, usable)) return;
+  if (tracePath(B, D, c, splitAlongMiddle(D, P))) return;
   tracePaths(B, D, {c});
 }
 
@@ -1592,16 +1591,16 @@ void placeCutEnds(const MeccanoSurface& B, CutSolid& D) {
   }
 }
 
-/// Position along a half-chain in the lattice.
-Vec3 latticeAt(const MeccanoSurface& B, int h, double part) {
-  const Vec3 a = latticeVector(B.start(h)), b = latticeVector(B.start(h ^ 1));
-  return a + part * (b - a);
-}
-
 Vec2 inRectangle(const BoundaryMapping::Rectangle& R, Vec3 p) {
   const int u = (R.axis + 1) % 3, v = (R.axis + 2) % 3;
   return {(component(p, u) - R.lo[u]) / (R.hi[u] - R.lo[u]),
           (component(p, v) - R.lo[v]) / (R.hi[v] - R.lo[v])};
+}
+
+/// u at this part of a half-chain.
+Vec2 inRectangle(const BoundaryMapping::Rectangle& R, const MeccanoSurface& B, int h, double part) {
+  const Vec2 a = inRectangle(R, latticeVector(B.start(h)));
+  return a + part * (inRectangle(R, latticeVector(B.start(h ^ 1))) - a);
 }
 
 /// Each rectangle by Floater onto its place; those of one flat region are one patch.
@@ -1626,7 +1625,7 @@ void addPatches(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi)
     Parametrization& P = Pi.patches[R.region];
     const BoundaryMapping::Rectangle& place = Pi.rectangles[R.region];
     Disk disk = diskAt(D, triangleLeftOf(D, R.rim[0]));
-    flatten(disk, [&](int h, double part) { return inRectangle(place, latticeAt(B, h, part)); });
+    flatten(disk, [&](int h, double part) { return inRectangle(place, B, h, part); });
     for (std::array<int, 3> t : disk.triangles) {
       for (int& n : t) {
         const int vertex = disk.vertex[n];
@@ -1671,12 +1670,12 @@ void addCurves(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) 
     while (B.start(h)[axis] == B.start(h ^ 1)[axis]) ++axis;
     if (B.regions[regions[0]].axis != (axis + 1) % 3) std::swap(regions[0], regions[1]);
     for (int r : regions) C.sides.push_back({-(r + 1), {}});
-    auto add = [&](int point, Vec3 xi) {
+    auto add = [&](int point, int g, double part) {
       const double step = C.points.empty() ? 0 : norm(D.points[point] - C.points.back());
       C.s.push_back(C.s.empty() ? 0 : C.s.back() + step);
       C.points.push_back(D.points[point]);
       for (int i = 0; i < 2; ++i)
-        C.sides[i].u.push_back(inRectangle(Pi.rectangles[regions[i]], xi));
+        C.sides[i].u.push_back(inRectangle(Pi.rectangles[regions[i]], B, g, part));
     };
     int last = h;
     for (int g = h; g >= 0; last = g, g = straightOn(B, g)) {
@@ -1685,9 +1684,9 @@ void addCurves(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) 
       for (std::size_t k = 1; k < path.size(); ++k)
         s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
       for (std::size_t k = 0; k + 1 < path.size(); ++k)
-        add(path[k], latticeAt(B, g, s[k] / s.back()));
+        add(path[k], g, s[k] / s.back());
     }
-    add(D.node[B.startNode(last ^ 1)], latticeVector(B.start(last ^ 1)));
+    add(D.node[B.startNode(last ^ 1)], last ^ 1, 0);
     Pi.curves.push_back(C);
     Pi.segments.push_back({B.start(h), B.start(last ^ 1)});
     const int number = static_cast<int>(Pi.curves.size());
@@ -1901,71 +1900,83 @@ Mesh getInitialMesh(const Meccano& C, const BoundaryMapping& Pi) {
   return M;
 }
 
-void placeInterior(Mesh& M) {
-  const std::size_t nodes = M.x.size();
-  std::vector<char> isInner(nodes);
-  for (std::size_t n = 0; n < nodes; ++n) isInner[n] = M.dimension[n] == 3;
-  // Stiffness of linear elements: ∫ ∇λ_i · ∇λ_j, without the diagonal (rows sum to 0).
+namespace {
+
+/// Stiffness of linear elements in ξ, ∫ ∇λ_i · ∇λ_j, at the inner nodes of a mesh.
+struct Stiffness {
   struct Element {
     std::array<int, 4> z;
     double k[4][4];
   };
   std::vector<Element> elements;
-  std::vector<double> diagonal(nodes, 0.0);
-  for (const std::array<int, 4>& z : M.tets) {
-    if (!(isInner[z[0]] || isInner[z[1]] || isInner[z[2]] || isInner[z[3]])) continue;
-    Element E{z, {}};
-    const Mat3 edges{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]};
-    const Mat3 cof = cofactor(edges);
-    const Vec3 g[4] = {-(cof.c0 + cof.c1 + cof.c2), cof.c0, cof.c1, cof.c2};
-    for (int i = 0; i < 4; ++i)
-      for (int j = 0; j < 4; ++j)
-        if (i != j) {
+  std::vector<char> isInner;
+  std::vector<double> diagonal;
+
+  explicit Stiffness(const Mesh& M) : isInner(M.x.size()), diagonal(M.x.size(), 0) {
+    for (std::size_t n = 0; n < M.x.size(); ++n) isInner[n] = M.dimension[n] == 3;
+    for (const std::array<int, 4>& z : M.tets) {
+      if (!(isInner[z[0]] || isInner[z[1]] || isInner[z[2]] || isInner[z[3]])) continue;
+      Element E{z, {}};
+      const Mat3 edges{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]};
+      const Mat3 cof = cofactor(edges);
+      const Vec3 g[4] = {-(cof.c0 + cof.c1 + cof.c2), cof.c0, cof.c1, cof.c2};
+      for (int i = 0; i < 4; ++i)
+        for (int j = 0; j < 4; ++j) {
+          if (i == j) continue;
           E.k[i][j] = dot(g[i], g[j]) / (6 * std::abs(det(edges)));
-          diagonal[z[i]] -= E.k[i][j];
+          diagonal[z[i]] -= E.k[i][j];  // rows sum to 0
         }
-    elements.push_back(E);
+      elements.push_back(E);
+    }
   }
-  using Field = std::vector<Vec3>;
-  auto product = [&](const Field& p) {
-    Field y(nodes);
+  /// Of the stiffness matrix with a field; 0 at the other nodes.
+  std::vector<Vec3> product(const std::vector<Vec3>& p) const {
+    std::vector<Vec3> y(p.size());
     for (const Element& E : elements)
       for (int i = 0; i < 4; ++i)
         for (int j = 0; j < 4; ++j)
-          if (i != j) y[E.z[i]] += E.k[i][j] * (p[E.z[j]] - p[E.z[i]]);
-    for (std::size_t n = 0; n < nodes; ++n)
-      if (!isInner[n]) y[n] = {};
+          if (i != j && isInner[E.z[i]]) y[E.z[i]] += E.k[i][j] * (p[E.z[j]] - p[E.z[i]]);
     return y;
-  };
-  auto inner = [&](const Field& a, const Field& b) {
-    double sum = 0;
-    for (std::size_t n = 0; n < nodes; ++n) sum += dot(a[n], b[n]);
-    return sum;
-  };
-  auto scaled = [&](Field r) {  // by the diagonal
-    for (std::size_t n = 0; n < nodes; ++n)
-      if (isInner[n]) r[n] = (1 / diagonal[n]) * r[n];
-    return r;
-  };
-  // Conjugate gradients for the three coordinates at once.
+  }
+};
+
+double innerProduct(const std::vector<Vec3>& a, const std::vector<Vec3>& b) {
+  double sum = 0;
+  for (std::size_t n = 0; n < a.size(); ++n) sum += dot(a[n], b[n]);
+  return sum;
+}
+
+}  // namespace
+
+void placeInterior(Mesh& M) {
   constexpr double tolerance = 1e-10;  // of the first residual's norm: far below any element
   constexpr int maxIterations = 5000;
-  Field r = product(M.x);
+  const Stiffness K(M);
+  auto scaled = [&](std::vector<Vec3> r) {
+    for (std::size_t n = 0; n < r.size(); ++n)
+      if (K.isInner[n]) r[n] = (1 / K.diagonal[n]) * r[n];
+    return r;
+  };
+  // Conjugate gradients with the diagonal as preconditioner, for the three coordinates at once.
+  std::vector<Vec3> r = K.product(M.x);
   for (Vec3& v : r) v = -v;
-  Field z = scaled(r), p = z;
-  double rz = inner(r, z);
+  std::vector<Vec3> z = scaled(r), p = z;
+  double rz = innerProduct(r, z);
   const double goal = tolerance * tolerance * rz;
   for (int iteration = 0; rz > goal; ++iteration) {
     if (iteration == maxIterations)
       throw SolverError("placeInterior (§2): conjugate gradients did not reach " +
                         number(tolerance) + " in " + std::to_string(maxIterations) +
                         " iterations; the mesh's computational elements are degenerate");
-    const Field Ap = product(p);
-    const double alpha = rz / inner(p, Ap);
-    for (std::size_t n = 0; n < nodes; ++n) M.x[n] += alpha * p[n], r[n] += -alpha * Ap[n];
+    const std::vector<Vec3> Kp = K.product(p);
+    const double alpha = rz / innerProduct(p, Kp);
+    for (std::size_t n = 0; n < p.size(); ++n) {
+      M.x[n] += alpha * p[n];
+      r[n] += -alpha * Kp[n];
+    }
     z = scaled(r);
-    const double next = inner(r, z), beta = next / rz;
-    for (std::size_t n = 0; n < nodes; ++n) p[n] = z[n] + beta * p[n];
+    const double next = innerProduct(r, z);
+    for (std::size_t n = 0; n < p.size(); ++n) p[n] = z[n] + (next / rz) * p[n];
     rz = next;
   }
 }
@@ -2191,6 +2202,42 @@ Bisection::EdgeEntity Bisection::entityOf(int a, int b, const std::vector<int>& 
   return seen >= 4 ? EdgeEntity{2, surface} : EdgeEntity{1, M.surfaces[surface - 1].rim};
 }
 
+namespace {
+
+/// [§3.6 departure] Whether the edge ab of a surface passes over a slit or an overlap of it: its
+/// parametric midpoint is far from it (farther than the edge is long).
+bool isBridging(Vec3 a, Vec3 b, Vec3 parametricMidpoint) {
+  return norm2(parametricMidpoint - .5 * (a + b)) > norm2(b - a);
+}
+
+/// The point of a surface nearest to x, and its parameter.
+Vec3 nearestOn(const Parametrization& P, Vec3 x, Vec2& u) {
+  ClosestPoint best{1e300, {}, -1, {}, Feature::face, 0};
+  for (const std::array<int, 3>& t : P.triangles) {
+    const ClosestPoint p =
+        closestPointOnTriangle(x, P.points[t[0]], P.points[t[1]], P.points[t[2]]);
+    if (p.distance >= best.distance) continue;
+    best = p;
+    u = p.w[0] * P.u[t[0]] + p.w[1] * P.u[t[1]] + p.w[2] * P.u[t[2]];
+  }
+  return best.point;
+}
+
+/// On a curve that an edge of this length bridges: half of it along the curve from one of its ends,
+/// the one that is nearer to x.
+double besideBridge(const Curve& C, double s0, double s1, double length, Vec3 x) {
+  const double L = C.s.back();
+  double forward = s1 - s0;  // from s0 to s1, the short way
+  if (C.closed && forward > L / 2) forward -= L;
+  if (C.closed && forward < -L / 2) forward += L;
+  const double step = std::copysign(length / 2, forward);
+  double near = s0 + step, far = s1 - step;
+  if (norm2(gamma(C, far) - x) < norm2(gamma(C, near) - x)) near = far;
+  return C.closed ? near - L * std::floor(near / L) : near;
+}
+
+}  // namespace
+
 int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
   const EdgeEntity e = entityOf(a, b, around);
   Vec3 x = .5 * (M.x[a] + M.x[b]);
@@ -2201,13 +2248,19 @@ int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
     Vec2 u0, u1;
     if (parameterOn(M, a, e.entity, u0) && parameterOn(M, b, e.entity, u1)) {
       dimension = 2, entity = e.entity, parameter = .5 * (u0 + u1);
-      x = varphi(surfaceOf(M, entity), parameter);
+      const Vec3 onS = varphi(surfaceOf(M, entity), parameter);
+      if (!isBridging(M.x[a], M.x[b], onS))
+        x = onS;
+      else
+        x = nearestOn(surfaceOf(M, entity), x, parameter);
     }
   } else if (e.dimension == 1 && e.entity > 0) {
     double s0 = 0, s1 = 0;
     if (parameterOnCurve(M, a, e.entity, s0) && parameterOnCurve(M, b, e.entity, s1)) {
       const Curve& C = M.curves[e.entity - 1];
       dimension = 1, entity = e.entity, parameter = {curveMidpoint(C, s0, s1), 0};
+      if (isBridging(M.x[a], M.x[b], gamma(C, parameter.x)))
+        parameter.x = besideBridge(C, s0, s1, norm(M.x[b] - M.x[a]), x);
       x = gamma(C, parameter.x);
     }
   }
@@ -3255,6 +3308,50 @@ std::vector<std::vector<int>> rimLoops(const TriangleSurface& S) {
   return loops;
 }
 
+std::vector<TriangleSurface> connectedComponents(const TriangleSurface& S,
+                                                 std::vector<std::string>& warnings) {
+  checkNumbers(S);
+  std::vector<std::string> repairs;
+  const TriangleSurface welded = weldAndDrop(S, repairs).S;
+  Parts parts(welded.points.size());
+  for (const std::array<int, 3>& t : welded.triangles) {
+    parts.join(t[0], t[1]);
+    parts.join(t[1], t[2]);
+  }
+  std::vector<TriangleSurface> components;
+  std::vector<int> componentOf(welded.points.size(), -1), numberOf(welded.points.size(), -1);
+  for (const std::array<int, 3>& t : welded.triangles) {
+    int& c = componentOf[parts.of(t[0])];
+    if (c < 0) {
+      c = static_cast<int>(components.size());
+      const std::string number = std::to_string(c + 1);
+      components.push_back({{}, {}, S.name.empty() ? number : S.name + '.' + number});
+    }
+    TriangleSurface& C = components[c];
+    std::array<int, 3> v = t;
+    for (int& n : v) {
+      int& number = numberOf[n];
+      if (number < 0) {
+        number = static_cast<int>(C.points.size());
+        C.points.push_back(welded.points[n]);
+      }
+      n = number;
+    }
+    C.triangles.push_back(v);
+  }
+  if (components.size() < 2) return {S};
+  warnings = repairs;
+  warnings.push_back("§3.1: '" + S.name + "' has " + std::to_string(components.size()) +
+                     " components; each becomes a surface: " + components.front().name + " to " +
+                     components.back().name);
+  return components;
+}
+
+TriangleSurface weldSurface(const TriangleSurface& S, std::vector<std::string>& warnings) {
+  checkNumbers(S);
+  return weldAndDrop(S, warnings).S;
+}
+
 TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings) {
   checkNumbers(S);
   CleanSurface C = weldAndDrop(S, warnings);
@@ -3268,7 +3365,7 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
   if (sizes.size() > 1)
     refuseSurface("the surface has " + std::to_string(sizes.size()) +
                   " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
-                  std::to_string(sizes.back()) + " triangles); insert them one by one");
+                  std::to_string(sizes.back()) + " triangles); insert them one by one, or by insertSurfaces");
   const int turned = orientConsistently(C.S, neighbours);
   if (turned < 0) refuseSurface("the surface is not orientable (a Moebius band); cut it open");
   if (turned > 0)
@@ -3905,6 +4002,16 @@ KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint
   return at;
 }
 
+/// Whether a node lies on ∂M. T may pass an earlier surface: its squares there are no candidates.
+bool isOnBoundary(const Mesh& M, int n) {
+  int curve = 0;
+  if (M.dimension[n] == 2) return M.entity[n] < 0;
+  if (M.dimension[n] == 1) curve = M.entity[n];
+  if (M.dimension[n] == 0 && !M.corners[M.entity[n] - 1].on.empty())
+    curve = M.corners[M.entity[n] - 1].on[0].curve;
+  return curve > 0 && M.curves[curve - 1].sides[0].surface < 0;
+}
+
 /// The elements adjacent to the node, refined to T's level, join T.
 void addElementsAt(Bisection& B, Approximation& A, int node) {
   std::vector<int> around, added;
@@ -3945,10 +4052,9 @@ void volumetricHealing(Bisection& B, Approximation& A) {
       if (!isLocalDisk(cubes.get(key))) bad.push_back(meshNode.get(key));
     if (bad.empty()) return;
     for (int n : bad) {
-      if (B.M.dimension[n] < 3)
-        throw MethodError(
-            "insertSurface (§3.3): T reaches the boundary or another surface at node " +
-            std::to_string(n) + "; lower l_c");
+      if (isOnBoundary(B.M, n))
+        throw MethodError("insertSurface (§3.3): T reaches the boundary at node " +
+                          std::to_string(n) + "; lower l_c");
       addElementsAt(B, A, n);
     }
   }
@@ -4099,7 +4205,7 @@ namespace {
 /// Quarter e of a square is the triangle of its corners e, e + 1 and its centre.
 struct Survey {
   std::vector<signed char> side;  // [mesh nodes], +1 or −1, 0 off ∂T
-  std::vector<char> free;         // [squares], 0: touches another surface or the boundary
+  std::vector<char> free;         // [squares], 0: touches another surface, or lies beyond it
   std::vector<double> excess;     // [squares], tangential excess of the centre beyond the rim, in h
   std::vector<std::array<double, 4>> beyond;  // [squares], the same of the quarters
   std::vector<std::array<double, 4>>
@@ -4107,7 +4213,36 @@ struct Survey {
   std::vector<char> sharp;  // [mesh nodes], 1: the node nearest to a sharp corner of S
 };
 
+/// The faces of all inserted surfaces that meet the box of S, widened by `margin`.
+std::vector<std::array<int, 3>> facesAround(const Mesh& M, const SurfaceDistance& S,
+                                            double margin) {
+  const Vec3 wide = margin * Vec3{1, 1, 1};
+  const Vec3 lo = S.tree.nodes[0].box.lo - wide, hi = S.tree.nodes[0].box.hi + wide;
+  std::vector<std::array<int, 3>> faces;
+  for (std::size_t k = 1; k <= M.surfaces.size(); ++k)
+    for (const auto& face : surfaceFaces(M, static_cast<int>(k)))
+      if (boxesMeet(boxOf({M.x[face[0]], M.x[face[1]], M.x[face[2]]}), lo, hi))
+        faces.push_back(face);
+  return faces;
+}
+
+/// Whether the segment pq crosses a triangle of the tree.
+bool crossesAny(const TriangleTree& tree, const std::vector<Vec3>& x,
+                const std::vector<std::array<int, 3>>& triangles, Vec3 p, Vec3 q) {
+  const TriangleTree::Box box = boxOf({p, q, q});
+  bool crosses = false;
+  tree.visit(box.lo, box.hi, [&](int t) {
+    Vec3 where;
+    const std::array<int, 3>& v = triangles[t];
+    return crosses = segmentCrosses(p, q, {x[v[0]], x[v[1]], x[v[2]]}, where);
+  });
+  return crosses;
+}
+
 Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
+  constexpr double reach = 4;  // of h: no square of ∂T is farther from S
+  const std::vector<std::array<int, 3>> earlier = facesAround(M, S, reach * Q.h);
+  const TriangleTree tree(M.x, earlier);
   Survey survey;
   survey.side.assign(M.x.size(), 0);
   survey.sharp.assign(M.x.size(), 0);
@@ -4116,12 +4251,14 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
   for (const Square& s : Q.squares) {
     bool isFree = true;
     for (int n : s.node) isFree &= M.dimension[n] == 3;
+    const SurfaceQuery middle = S.query(s.centre);
+    isFree = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
     survey.free.push_back(isFree);
-    survey.excess.push_back(perH * S.query(s.centre).excess);
+    survey.excess.push_back(perH * middle.excess);
     std::array<double, 4> beyond{}, above{};
     for (int e = 0; e < 4; ++e) {
-      const Vec3 middle = (1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre);
-      const SurfaceQuery near = S.query(middle);
+      const SurfaceQuery near =
+          S.query((1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
       beyond[e] = perH * near.excess;
       if (!near.onRim) above[e] = perH * S.rimDistance(near.point);
     }
@@ -4486,6 +4623,28 @@ double uncovered(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S
   return weight * sum / area;
 }
 
+/// Where S has no square beside it because another surface is in the way: the place; empty: nowhere.
+std::string blockedPlace(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                         const Survey& survey, int side, const Selection& selected) {
+  constexpr double missed = 2;  // [choice] of h from S to S_M: at the rim one square may be missing
+  std::vector<std::array<int, 3>> triangles;
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    if (!selected[i]) continue;
+    const auto& n = Q.squares[i].node;
+    triangles.push_back({n[0], n[1], n[2]});
+    triangles.push_back({n[0], n[2], n[3]});
+  }
+  const TriangleTree tree(M.x, triangles);
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    bool isBlocked = !survey.free[i] && survey.excess[i] == 0;
+    for (int n : Q.squares[i].node) isBlocked = isBlocked && survey.side[n] == side;
+    if (!isBlocked) continue;
+    const Vec3 onS = S.query(Q.squares[i].centre).point;
+    if (tree.closest(onS, missed * Q.h).triangle < 0) return placeText(onS);
+  }
+  return "";
+}
+
 /// Marks for each sharp corner of S the nearest node of this side.
 void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
                       Survey& survey) {
@@ -4524,6 +4683,11 @@ Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const Surfac
     if (outline == Outline::halfSquares) rim.run(true);
   }
   result.fault = diskFault(Q, result.selected);
+  const std::string blocked = blockedPlace(M, Q, S, survey, side, result.selected);
+  if (!blocked.empty()) {
+    result.isBlocked = true;
+    result.fault = "another surface is nearer to S than its squares, near " + blocked;
+  }
   if (result.fault.empty()) result.energy = rim.energy() + uncovered(M, Q, S, result.selected);
   return result;
 }
@@ -5215,6 +5379,9 @@ constexpr double cornerReach = 2;
 /// cosine of the two tangents, and (step on S / wanted step − 1)². Least and longest step, of the
 /// wanted.
 constexpr double tangentWeight = .5, stepWeight = .25, leastStep = .25, longestStep = 4;
+/// [choice] Cost of one step over a slit, whose rim is near S_M all along: 4 steps twice as long as
+/// wanted cost 1. Near: this far from S_M, in h.
+constexpr double slitCost = 4, slitReach = 1.5;
 /// [choice] Samples of S's rim per h, and per rim node of S_M at least: leastStep needs 3.
 constexpr int samplesPerH = 6, samplesPerNode = 3;
 
@@ -5228,8 +5395,10 @@ struct RimArc {
 /// [§3.6 departure] The samples of S's rim, of `count` on the arc, that the nodes at the ends of
 /// the arc's edges go to: dynamic programming from edge to edge; the last node goes to the last
 /// sample.
-std::vector<int> followArc(const Curve& rim, const Curve& rimM, double h, const RimArc& arc,
-                           int count) {
+///   treeM  the triangles of S_M; where the rim of S stays near them, a step may pass over it: S_M
+///          bridges a slit or an overlap of S that is narrower than its squares
+std::vector<int> followArc(const Curve& rim, const Curve& rimM, const TriangleTree& treeM, double h,
+                           const RimArc& arc, int count) {
   const int edges = static_cast<int>(arc.wanted.size()), m = static_cast<int>(rimM.points.size());
   const double ds = arc.length / count;
   std::vector<Vec3> at, tangent;  // [samples + 1]
@@ -5238,14 +5407,17 @@ std::vector<int> followArc(const Curve& rim, const Curve& rimM, double h, const 
     at.push_back(gamma(rim, s));
     tangent.push_back(unitVector(gamma(rim, s + h / 2) - gamma(rim, s - h / 2)));
   }
+  std::vector<int> nearFrom(count + 1, 0);  // the first sample from which on to k all are near S_M
+  for (int k = 1; k <= count; ++k)
+    nearFrom[k] = treeM.closest(at[k], slitReach * h).triangle < 0 ? k : nearFrom[k - 1];
   // least[k]: cost of the nodes so far with the last at sample k; step[e][k]: its step, 0: none
   RealVector least(count + 1, beyondAll), before, stepCost;
-  std::vector<std::vector<std::uint16_t>> step(edges, std::vector<std::uint16_t>(count + 1, 0));
+  std::vector<std::vector<int>> step(edges, std::vector<int>(count + 1, 0));
   least[0] = 0;
   for (int e = 0; e < edges; ++e) {
     const double wanted = arc.wanted[e] / ds;  // in samples
     const int lo = std::max(1, static_cast<int>(leastStep * wanted));
-    const int hi = static_cast<int>(std::min(longestStep * wanted + 1, 65535.));
+    const int hi = static_cast<int>(longestStep * wanted + 1);
     stepCost.assign(hi + 1, 0);
     for (int g = lo; g <= hi; ++g) stepCost[g] = stepWeight * (g / wanted - 1) * (g / wanted - 1);
     before.assign(count + 1, beyondAll);
@@ -5253,12 +5425,21 @@ std::vector<int> followArc(const Curve& rim, const Curve& rimM, double h, const 
     const int i = (arc.first + e + 1) % m;
     const Vec3 x = rimM.points[i];
     const Vec3 tangentM = unitVector(rimM.points[(i + 1) % m] - rimM.points[(i + m - 1) % m]);
+    int slit = -1;
     for (int k = lo; k <= count; ++k) {
       for (int g = lo; g <= std::min(hi, k); ++g)
         if (before[k - g] + stepCost[g] < least[k]) {
           least[k] = before[k - g] + stepCost[g];
-          step[e][k] = static_cast<std::uint16_t>(g);
+          step[e][k] = g;
         }
+      // over a slit: from the best sample since S's rim came near S_M
+      if (k - hi - 1 >= nearFrom[k]) {
+        if (slit < nearFrom[k] || before[k - hi - 1] < before[slit]) slit = k - hi - 1;
+      }
+      if (slit >= nearFrom[k] && slit >= 0 && before[slit] + slitCost < least[k]) {
+        least[k] = before[slit] + slitCost;
+        step[e][k] = k - slit;
+      }
       if (least[k] < beyondAll)
         least[k] += norm2(x - at[k]) / (h * h) + tangentWeight * (1 - dot(tangentM, tangent[k]));
     }
@@ -5311,6 +5492,7 @@ RimTargets rimTargets(const ApproximatingSurface& SM, const SurfaceParametrizati
   const int m = static_cast<int>(SM.rim.size());
   const double L = Phi.rim.s.back();
   const Curve rimM = closedCurve(SM.S.points, SM.rim);
+  const TriangleTree treeM(SM.S.points, SM.S.triangles);
   std::array<Vec3, 4> corners;
   for (int c = 0; c < 4; ++c) corners[c] = gamma(Phi.rim, Phi.cornerS[c]);
   const std::array<int, 4> at = matchedCorners(rimM.points, cornerBonus(SM), corners);
@@ -5334,7 +5516,7 @@ RimTargets rimTargets(const ApproximatingSurface& SM, const SurfaceParametrizati
     const int count =
         std::max(samplesPerNode * edges, static_cast<int>(samplesPerH * arc.length / SM.h));
     std::vector<int> sample;
-    if (followRim) sample = followArc(Phi.rim, rimM, SM.h, arc, count);
+    if (followRim) sample = followArc(Phi.rim, rimM, treeM, SM.h, arc, count);
     double s = from;
     for (int e = 0; e < edges; ++e) {
       targets.s[(first + e) % m] = s < L ? s : s - L;
@@ -5351,7 +5533,7 @@ constexpr int maxRings = 63;
 
 /// Takes the anchors of the points of the triangles and of `rings` rings of triangles around away.
 void weakenAnchors(const TriangleSurface& S, const std::vector<int>& triangles, int rings,
-                   std::vector<double>& mu) {
+                   const std::vector<char>& held, std::vector<double>& mu) {
   std::vector<char> marked(S.points.size(), 0);
   for (int t : triangles)
     for (int n : S.triangles[t]) marked[n] = 1;
@@ -5362,14 +5544,45 @@ void weakenAnchors(const TriangleSurface& S, const std::vector<int>& triangles, 
         for (int n : t) marked[n] = 1;
   }
   for (std::size_t i = 0; i < mu.size(); ++i)
-    if (marked[i]) mu[i] *= foldedFactor;
+    if (marked[i] && !held[i]) mu[i] *= foldedFactor;
+}
+
+/// The triangles of S_M that pass over a slit or an overlap of S: in 𝓤 the middle of an edge, from
+/// anchor to anchor, belongs to a place of S far from it.
+std::vector<char> bridgingTriangles(const ApproximatingSurface& SM, const Parametrization& Phi,
+                                    const std::vector<Vec2>& anchor) {
+  constexpr double far = 3;  // [choice] of h; a distorted map or a bent S stay below
+  std::vector<char> bridges(SM.S.triangles.size(), 0);
+  for (std::size_t t = 0; t < bridges.size(); ++t)
+    for (int e = 0; e < 3; ++e) {
+      const int a = SM.S.triangles[t][e], b = SM.S.triangles[t][(e + 1) % 3];
+      const Vec3 middle = varphi(Phi, .5 * (anchor[a] + anchor[b]));
+      if (norm(middle - .5 * (SM.S.points[a] + SM.S.points[b])) > far * SM.h) bridges[t] = 1;
+    }
+  return bridges;
+}
+
+/// [§3.6 departure] Nodes of bridging triangles keep their anchors, ϕ⁻¹ of the nearest point: the
+/// map of one disk to the other cannot cross a slit that S_M does not have.
+///   returns  the nodes that are held
+std::vector<char> holdBridges(const ApproximatingSurface& SM, const std::vector<char>& bridges,
+                              std::vector<double>& mu) {
+  constexpr double heldMu = 1e6;  // of the sum of the λ: they no longer matter
+  std::vector<char> held(mu.size(), 0);
+  for (std::size_t t = 0; t < bridges.size(); ++t)
+    for (int n : SM.S.triangles[t])
+      if (bridges[t] && !SM.isRim[n]) held[n] = 1;
+  for (std::size_t i = 0; i < mu.size(); ++i)
+    if (held[i]) mu[i] = heldMu;
+  return held;
 }
 
 /// [§3.6 departure] ϕ_M⁻¹ anchored at ϕ⁻¹ of the nearest points of S; where triangles fold the
 /// anchors go, in growing rings, until none folds.
 ///   u  set at the rim
 std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDistance& S,
-                              const std::vector<Vec2>& uS, std::vector<Vec2> u) {
+                              const Parametrization& Phi, std::vector<Vec2> u) {
+  const std::vector<Vec2>& uS = Phi.u;
   std::vector<double> mu(u.size(), 0.0);
   for (std::size_t i = 0; i < u.size(); ++i) {
     if (SM.isRim[i]) continue;
@@ -5380,11 +5593,15 @@ std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDista
   }
   const SparseMatrix lambda = meanValueWeights(SM.S.points, SM.S.triangles, SM.isRim);
   const std::vector<Vec2> anchor = u;
+  const std::vector<char> bridges = bridgingTriangles(SM, Phi, anchor);
+  const std::vector<char> held = holdBridges(SM, bridges, mu);
   for (int rings = 0; rings <= maxRings; rings = 2 * rings + 1) {
     u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor);
-    const std::vector<int> flipped = flippedTriangles(SM.S.triangles, u);
+    std::vector<int> flipped;
+    for (int t : flippedTriangles(SM.S.triangles, u))
+      if (!bridges[t]) flipped.push_back(t);
     if (flipped.empty()) return u;
-    weakenAnchors(SM.S, flipped, rings, mu);
+    weakenAnchors(SM.S, flipped, rings, held, mu);
   }
   return floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
 }
@@ -5431,12 +5648,12 @@ ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool
   std::vector<Vec2> u(SM.node.size());  // ϕ_M⁻¹, eq. (3)
   for (std::size_t i = 0; i < SM.rim.size(); ++i)
     u[SM.rim[i]] = rimParameter(Phi.cornerS, Phi.rim.s.back(), targets.s[i]);
-  u = followRim ? anchoredMap(SM, S, Phi.surface.u, u)
+  buildLocator(Phi.surface);
+  u = followRim ? anchoredMap(SM, S, Phi.surface, u)
                 : floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
 
   Phi.surface.rim = static_cast<int>(M.curves.size()) + 1;
   Phi.rim.sides[0].surface = k;
-  buildLocator(Phi.surface);
   M.surfaces.push_back(Phi.surface);
   M.curves.push_back(Phi.rim);
   ProjectionReport report;
@@ -5484,6 +5701,10 @@ void checkOptions(const InsertOptions& options, std::size_t nodes) {
   checkOptions(options.optimize, nodes);
 }
 
+/// [choice] Of a surface's diagonal: what is as near as this touches. Coordinates far from their
+/// origin (UTM) are good to 1e-10 of it.
+constexpr double touching = 1e-9;
+
 std::string at(const Gap& gap) {
   return " at triangle " + std::to_string(gap.triangle) + " near " + placeText(gap.point);
 }
@@ -5500,16 +5721,6 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   if (!(lc < gap.distance))
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below dist(∂M, S) = " +
                      number(gap.distance) + at(gap) + "; lower l_c");
-  for (const Parametrization& earlier : M.surfaces) {
-    const Gap between = smallestGap(S.tree, earlier.points, earlier.triangles);
-    if (between.distance <= 0)
-      throw InputError("insertSurface (§3.1): S touches the inserted surface '" + earlier.name +
-                       "'" + at(between) + "; surfaces must not meet");
-    if (!(lc < between.distance))
-      throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below the distance " +
-                       number(between.distance) + " to the inserted surface '" + earlier.name +
-                       "'" + at(between) + "; lower l_c");
-  }
 }
 
 /// l_c against the size of what comes: not more tetrahedra than allowed, not smaller than S.
@@ -5557,6 +5768,8 @@ struct Insertion {
   int ways = 0;    // tried so far, over all l_c
   int faults = 0;  // and left; why the last one was, without prefix and advice
   std::string reason = {};
+  bool isBlocked = false;  // at this l_c, by an earlier surface
+  double lowest = 0;       // q of the best way so far
 
   void stage(const char* name, const Mesh& mesh) const {
     if (options.onStage) options.onStage(name, mesh);
@@ -5588,7 +5801,10 @@ std::vector<Way> extractWays(Insertion& I, Outline outline) {
       ways.push_back(std::move(way));
     else
       I.leave(describe(way),
-              MethodError("insertSurface (§3.4): S_M is no disk, " + way.extraction.fault));
+              MethodError("insertSurface (§3.4): " +
+                          std::string(way.extraction.isBlocked ? "" : "S_M is no disk, ") +
+                          way.extraction.fault));
+    I.isBlocked = I.isBlocked || way.extraction.isBlocked;
   }
   if (ways.size() == 2 && ways[1].extraction.energy < ways[0].extraction.energy)
     std::swap(ways[0], ways[1]);
@@ -5607,6 +5823,19 @@ std::vector<int> nodesNear(const Mesh& M, int k) {
   for (std::size_t n = 0; n < near.size(); ++n)
     if (near[n]) nodes.push_back(static_cast<int>(n));
   return nodes;
+}
+
+/// Lowest q of the elements at S_M and of their neighbours.
+double lowestNear(const Mesh& M, int k) {
+  std::vector<char> near(M.x.size(), 0);
+  for (int n : nodesNear(M, k)) near[n] = 1;
+  const std::vector<double> q = qualities(M);
+  double lowest = 1;
+  for (std::size_t E = 0; E < q.size(); ++E) {
+    const std::array<int, 4>& z = M.tets[E];
+    if (near[z[0]] || near[z[1]] || near[z[2]] || near[z[3]]) lowest = std::min(lowest, q[E]);
+  }
+  return lowest;
 }
 
 /// Lets a node fixed at a sharp corner of S slide along the rim.
@@ -5674,13 +5903,13 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
                       " elements stay inverted");
 }
 
-/// The measures of S_M that the report promises, and the warnings.
-void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertReport& report) {
+/// The measures of S_M that the report promises.
+///   errors  MethodError: a node of it is off S
+void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& report) {
   constexpr int samples = 4;
-  constexpr double poorHausdorff = .3, badHausdorff = .5;  // [choice] of l_c: warned of, refused
-  constexpr double poorShift = 2;                          // [choice] of h: warned of
   const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
   std::vector<char> on(M.x.size(), 0);
+  report.nodes = 0, report.maxNodeDistance = 0;
   for (const auto& face : faces)
     for (int n : face) {
       if (on[n]) continue;
@@ -5696,6 +5925,12 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, double h, InsertRep
                       " away from S");
   report.triangles = static_cast<int>(faces.size());
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
+}
+
+/// Refuses S_M where it is far from S, and warns where it is poor.
+void judgeSurface(double h, InsertReport& report) {
+  constexpr double poorHausdorff = .3, badHausdorff = .5;  // [choice] of l_c: warned of, refused
+  constexpr double poorShift = 2;                          // [choice] of h: warned of
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
                       number(report.hausdorff) +
@@ -5717,7 +5952,8 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
   ofThisWay.surface = I.k, ofThisWay.lc = lc;
   try {
     insertOnWay(I, way, trial, ofThisWay);
-    measureSurface(trial, I.S, I.Q.h, ofThisWay);
+    measureSurface(trial, I.S, ofThisWay);
+    judgeSurface(I.Q.h, ofThisWay);
   } catch (const MethodError& error) {
     I.leave(describe(way), error);
     return;
@@ -5725,8 +5961,20 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
     I.leave(describe(way), error);
     return;
   }
-  if (report.surface == 0 || ofThisWay.smoothed.min > report.smoothed.min)
-    report = ofThisWay, result = std::move(trial);
+  // beside earlier surfaces the lowest q may be theirs, on every way
+  const double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
+  if (report.surface == 0 || lowest > I.lowest)
+    report = ofThisWay, result = std::move(trial), I.lowest = lowest;
+}
+
+/// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
+/// come nearer.
+void checkFacesApart(Insertion& I) {
+  const Gap gap = smallestGap(I.S.tree, I.M.x, facesAround(I.M, I.S, 0));
+  if (gap.triangle < 0 || gap.distance > 0) return;
+  I.isBlocked = true;
+  throw MethodError("insertSurface (§3.2): S crosses the faces of an earlier surface" + at(gap) +
+                    "; lower l_c");
 }
 
 /// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
@@ -5740,6 +5988,7 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   Bisection B(I.M);
   I.A = volumetricApproximation(B, I.S, lc);
   I.stage("approximated", I.M);
+  checkFacesApart(I);
   volumetricHealing(B, I.A);
   I.Q = boundarySquares(I.M, I.A);
   I.stage("healed", I.M);
@@ -5748,7 +5997,8 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   const double good = I.M.tets.size() < large ? goodQuality : goodLargeQuality;
   auto isGood = [&] {
     return report.surface > 0 &&
-           (report.smoothed.min >= good || I.options.outline == Outline::paper);
+           (I.lowest >= std::min(good, report.original.min) ||
+            I.options.outline == Outline::paper);
   };
   std::vector<Outline> outlines{I.options.outline};
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
@@ -5765,44 +6015,176 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
 
 }  // namespace
 
-InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
-  constexpr int maxHalvings = 1;  // [choice] of l_c, where no way is valid
-  checkMeccano(M, "insertSurface (§3.1)");
-  checkOptions(options, M.x.size());
-  InsertReport report;
-  report.original = qualityStatistics(M);
-  if (report.original.inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " +
-                     std::to_string(report.original.inverted) +
-                     " inverted elements; untangle it first (optimizeMesh)");
+namespace {
+
+/// A surface of the call that has passed §3.1.
+struct Candidate {
+  SurfaceDistance S;
+  std::string label;  // for messages
   std::vector<std::string> warnings;
+};
+
+Candidate candidateOf(const TriangleSurface& S, const std::string& label,
+                      std::vector<std::string> warnings = {}) {
   TriangleSurface disk = checkSurface(S, warnings);
   splitChords(disk);
-  const SurfaceDistance cleaned(disk);
+  return {SurfaceDistance(disk), label, std::move(warnings)};
+}
+
+/// Does what step() does; its errors begin with the label of the surface.
+template <class Step>
+auto labelled(const std::string& label, Step step) -> decltype(step()) {
+  const std::string prefix = label.empty() ? "" : label + ": ";
+  try {
+    return step();
+  } catch (const InputError& error) {
+    throw InputError(prefix + error.what());
+  } catch (const MethodError& error) {
+    throw MethodError(prefix + error.what());
+  } catch (const SolverError& error) {
+    throw SolverError(prefix + error.what());
+  }
+}
+
+std::string labelOf(const std::string& name, std::size_t number) {
+  return name.empty() ? "surface " + std::to_string(number) : "surface '" + name + "'";
+}
+
+/// The surfaces of a call, each component one; labels only where there are several.
+std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S) {
+  std::vector<Candidate> all;
+  for (std::size_t i = 0; i < S.size(); ++i) {
+    const std::string given = S.size() > 1 ? labelOf(S[i].name, i + 1) : "";
+    std::vector<std::string> warnings;
+    const std::vector<TriangleSurface> components =
+        labelled(given, [&] { return connectedComponents(S[i], warnings); });
+    for (const TriangleSurface& one : components) {
+      const std::string label = components.size() > 1 ? labelOf(one.name, i + 1) : given;
+      all.push_back(labelled(label, [&] { return candidateOf(one, label, warnings); }));
+      warnings.clear();
+    }
+  }
+  return all;
+}
+
+/// [§3.1] Refuses two surfaces of the call, or one and an earlier one, that cross or touch.
+void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
+  auto check = [](const Candidate& S, const std::string& other, const std::vector<Vec3>& points,
+                  const std::vector<std::array<int, 3>>& triangles) {
+    const Gap gap = smallestGap(S.S.tree, points, triangles);
+    const TriangleTree::Box& box = S.S.tree.nodes[0].box;
+    if (gap.distance <= touching * norm(box.hi - box.lo))
+      throw InputError("insertSurfaces (§3.1): " + (S.label.empty() ? "S" : S.label) + " and " +
+                       other + " cross or touch" + at(gap) +
+                       "; surfaces must not meet: cut one back, or leave one out");
+  };
+  for (std::size_t i = 0; i < all.size(); ++i) {
+    for (std::size_t k = 0; k < M.surfaces.size(); ++k)
+      check(all[i], "the inserted " + labelOf(M.surfaces[k].name, k + 1), M.surfaces[k].points,
+            M.surfaces[k].triangles);
+    for (std::size_t j = 0; j < i; ++j)
+      check(all[i], all[j].label, all[j].S.S.points, all[j].S.S.triangles);
+  }
+}
+
+/// The earlier surface nearest to S, for messages: "'name', 12.5 away at triangle 3 near (1, 2, 3)".
+struct Nearest {
+  std::string text;
+  double distance;
+};
+Nearest nearestEarlier(const Mesh& M, const SurfaceDistance& S) {
+  Nearest nearest{"", beyondAll};
+  for (std::size_t k = 0; k < M.surfaces.size(); ++k) {
+    const Gap gap = smallestGap(S.tree, M.surfaces[k].points, M.surfaces[k].triangles);
+    if (gap.distance < nearest.distance)
+      nearest = {labelOf(M.surfaces[k].name, k + 1) + " is " + number(gap.distance) + " away" +
+                     at(gap),
+                 gap.distance};
+  }
+  return nearest;
+}
+
+/// 3.2 to 3.7 for one surface; with half of l_c where no way is valid, and again where another
+/// surface is in the way.
+InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
+  constexpr int maxTries = 2;     // [choice] of l_c, with ways that were followed to the end
+  constexpr int maxHalvings = 4;  // [choice] of l_c in all, while another surface is in the way
+  const SurfaceDistance& cleaned = candidate.S;
+  InsertReport report;
+  report.original = qualityStatistics(M);
   checkDistances(M, cleaned, options.lc);
   checkSize(M, cleaned, options.lc, options.maxTets);
 
   Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1};
   Mesh result;
   double lc = options.lc;
-  for (int halving = 0; halving <= maxHalvings && report.surface == 0; ++halving, lc /= 2) try {
-      if (halving > 0) checkSize(M, cleaned, lc, options.maxTets);
+  bool wasBlocked = false;
+  for (int tries = 0, halvings = 0; tries < maxTries && halvings <= maxHalvings; ++halvings) {
+    const int waysBefore = I.ways;
+    I.isBlocked = false;
+    try {
+      if (halvings > 0) checkSize(M, cleaned, lc, options.maxTets);
       insertWithSize(I, M, lc, result, report);
     } catch (const MethodError& error) {
       I.leave("l_c = " + number(lc), error);
     }
+    if (report.surface > 0) break;
+    wasBlocked = wasBlocked || I.isBlocked;
+    if (I.ways > waysBefore || !I.isBlocked) ++tries;
+    lc /= 2;
+  }
+  const Nearest nearest = wasBlocked ? nearestEarlier(M, cleaned) : Nearest{"", 0};
   if (report.surface == 0)
     throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
-                      " nor at half of it, after " + std::to_string(I.faults) +
-                      " tries, the last because " + I.reason + "; lower l_c");
+                      " nor down to " + number(2 * lc) + ", after " + std::to_string(I.faults) +
+                      " tries, the last because " + I.reason +
+                      (wasBlocked ? "; " + nearest.text + ": lower l_c to " +
+                                        number(.5 * nearest.distance)
+                                  : "; lower l_c"));
+  std::vector<std::string> warnings = candidate.warnings;
   if (report.lc < options.lc)
-    warnings.push_back("l_c was halved to " + number(report.lc) + ", because at " +
-                       number(options.lc) + " no way was valid");
+    warnings.push_back("l_c was lowered from " + number(options.lc) + " to " + number(report.lc) +
+                       ", because " +
+                       (wasBlocked ? nearest.text : "at " + number(options.lc) + " no way was valid"));
   report.warnings.insert(report.warnings.begin(), warnings.begin(), warnings.end());
   report.regular = qualityStatistics(result, Ideal::regular);
   I.stage("smoothed", result);
   M = std::move(result);
   return report;
+}
+
+/// What an insertion asks of the mesh and the options before it looks at a surface.
+void checkStart(const Mesh& M, const InsertOptions& options) {
+  checkMeccano(M, "insertSurface (§3.1)");
+  checkOptions(options, M.x.size());
+  const int inverted = qualityStatistics(M).inverted;
+  if (inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(inverted) +
+                     " inverted elements; untangle it first (optimizeMesh)");
+}
+
+}  // namespace
+
+InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
+  checkStart(M, options);
+  const Candidate one = candidateOf(S, "");
+  checkApart(M, {one});
+  return insertCandidate(M, one, options);
+}
+
+std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
+                                         const InsertOptions& options) {
+  checkStart(M, options);
+  const std::vector<Candidate> all = candidatesOf(S);
+  checkApart(M, all);
+  Mesh result = M;
+  std::vector<InsertReport> reports;
+  for (const Candidate& one : all)
+    reports.push_back(labelled(one.label, [&] { return insertCandidate(result, one, options); }));
+  for (std::size_t i = 0; i < all.size(); ++i)  // later ones have refined and moved earlier ones
+    labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i]); });
+  M = std::move(result);
+  return reports;
 }
 
 }  // namespace meccano

@@ -2,11 +2,13 @@
 //
 // The command line over the library: everything that touches a file, the terminal or argv.
 //   Files            reading whole files, writing beside the target and renaming
-//   Wavefront OBJ    surfaces in
+//   Text             numbers, words and lines: what all readers and writers stand on
+//   Surfaces         OBJ, OFF, STL, PLY, GOCAD TSurf
 //   ESRI ASCII grids terrain in
 //   Polycubes        meccanos in
 //   VTK legacy       meshes out and in, with all that a later insertion needs
-//   Commands         box, terrain, solid, insert, optimize, stats
+//   Gmsh, MEDIT      meshes out and in, with labels and names
+//   Commands         box, terrain, solid, insert, optimize, stats, convert
 //   Arguments        options, help, exit status: 0 done and valid, 1 an error, 2 wrong usage
 #include <unistd.h>
 
@@ -14,6 +16,7 @@
 #include <cerrno>
 #include <charconv>
 #include <climits>
+#include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -23,7 +26,9 @@
 #include <map>
 #include <memory>
 #include <new>
+#include <set>
 #include <string_view>
+#include <unordered_map>
 
 #include "meccano.hpp"
 
@@ -199,10 +204,13 @@ bool parse(std::string_view word, int& value) {
 /// Walks over a text word by word, and knows the line for messages.
 class Scanner {
  public:
-  Scanner(const std::string& name, const std::string& text) : name_(name), text_(text) {}
+  /// Where a comment character is given, it and the rest of its line count as blank.
+  Scanner(const std::string& name, const std::string& text, char comment = '\0')
+      : name_(name), text_(text), comment_(comment) {}
 
   bool atEnd() {
-    while (at_ < text_.size() && isSpace(text_[at_])) ++at_;
+    while (at_ < text_.size() && (isSpace(text_[at_]) || (comment_ && text_[at_] == comment_)))
+      at_ = text_[at_] == comment_ ? std::min(text_.find('\n', at_), text_.size()) : at_ + 1;
     return at_ == text_.size();
   }
   std::string_view word(const char* what) {
@@ -221,6 +229,7 @@ class Scanner {
   }
   bool consumed() const { return at_ == text_.size(); }
   void skip(std::size_t bytes) { at_ += bytes; }
+  std::size_t position() const { return at_; }
   /// The rest of the line, without its end.
   std::string_view line() {
     start_ = at_;
@@ -259,14 +268,23 @@ class Scanner {
  private:
   const std::string& name_;
   const std::string& text_;
+  char comment_;
   std::size_t at_ = 0, start_ = 0;
 };
 
-// ==== Wavefront OBJ =============================================================================
+// ==== Lines of words ============================================================================
 
-/// The words of a line, up to a comment.
+std::string lower(std::string_view word) {
+  std::string s(word);
+  for (char& c : s)
+    if (c >= 'A' && c <= 'Z') c = static_cast<char>(c - 'A' + 'a');
+  return s;
+}
+
+bool hasByteOrderMark(const std::string& text) { return text.compare(0, 3, "\xEF\xBB\xBF") == 0; }
+
+/// Appends the words of a line, up to a comment (#).
 void splitWords(std::string_view line, std::vector<std::string_view>& words) {
-  words.clear();
   for (std::size_t i = 0; i < line.size();) {
     if (isSpace(line[i])) {
       ++i;
@@ -279,17 +297,76 @@ void splitWords(std::string_view line, std::vector<std::string_view>& words) {
   }
 }
 
-Vec3 objVertex(const std::vector<std::string_view>& words, const Scanner& at) {
-  Vec3 x;
-  if (words.size() < 4)
-    at.failHere("a vertex needs three coordinates, here are " + std::to_string(words.size() - 1) +
-                "; complete the line or remove it with its faces");
-  double* const to[3] = {&x.x, &x.y, &x.z};
-  for (int i = 0; i < 3; ++i)
-    if (!parse(words[i + 1], *to[i]))
-      at.failHere("'" + std::string(words[i + 1]) + "' is no number; correct the coordinate");
-  if (!isFinite(x)) at.failHere("a coordinate is not finite; correct it");
-  return x;
+/// A text line by line, each as its words: what all ASCII readers of surfaces stand on. Blank lines
+/// and comments (#) are passed over, a backslash at the end joins the next line.
+class Lines {
+ public:
+  Scanner in;
+  std::vector<std::string_view> words;  // of the line; not empty after next()
+
+  Lines(const std::string& name, const std::string& text) : in(name, text) {
+    if (hasByteOrderMark(text)) in.skip(3);
+  }
+  bool next() {
+    words.clear();
+    while (words.empty() && !in.consumed()) {
+      line_ = in.line();
+      splitWords(line_, words);
+      while (!words.empty() && words.back() == "\\" && !in.consumed()) {
+        words.pop_back();
+        splitWords(in.line(), words);
+      }
+    }
+    return !words.empty();
+  }
+  /// What stands behind the first word, with its inner blanks.
+  std::string rest() const {
+    const std::size_t from = words[0].data() + words[0].size() - line_.data();
+    std::string_view r = line_.substr(from);
+    while (!r.empty() && isSpace(r.front())) r.remove_prefix(1);
+    while (!r.empty() && isSpace(r.back())) r.remove_suffix(1);
+    return std::string(r);
+  }
+  int integer(std::size_t i, const char* what) const {
+    int value = 0;
+    if (i >= words.size()) in.failHere(std::string(what) + " is missing; complete the line");
+    if (!parse(words[i], value)) noNumber(i, what);
+    return value;
+  }
+  /// Three coordinates from word i on.
+  Vec3 point(std::size_t i) const {
+    if (words.size() < i + 3)
+      in.failHere("a vertex needs three coordinates, here are " +
+                  std::to_string(words.size() - std::min(words.size(), i)) +
+                  "; complete the line or remove it with its faces");
+    Vec3 x;
+    double* const to[3] = {&x.x, &x.y, &x.z};
+    for (std::size_t k = 0; k < 3; ++k)
+      if (!parse(words[i + k], *to[k])) noNumber(i + k, "the coordinate");
+    if (!isFinite(x)) in.failHere("a coordinate is not finite; correct it");
+    return x;
+  }
+
+ private:
+  [[noreturn]] void noNumber(std::size_t i, const char* what) const {
+    in.failHere("'" + std::string(words[i].substr(0, 40)) + "' is no number; correct " + what);
+  }
+  std::string_view line_;
+};
+
+// ==== Surfaces: OBJ, OFF, STL, PLY, GOCAD =======================================================
+
+std::string stemOf(const std::string& path) { return fs::path(path).stem().string(); }
+
+/// A polygon as a fan of triangles around its first corner.
+void addPolygon(TriangleSurface& S, const std::vector<int>& corners) {
+  for (std::size_t i = 2; i < corners.size(); ++i)
+    S.triangles.push_back({corners[0], corners[i - 1], corners[i]});
+}
+
+[[noreturn]] void failTooFewCorners(const Scanner& at, std::size_t corners) {
+  at.failHere("a face needs three corners, here are " + std::to_string(corners) +
+              "; complete the line or remove it");
 }
 
 /// The vertex of a face corner a, a/b, a//c or a/b/c; negative numbers count from the last vertex.
@@ -299,7 +376,7 @@ int objIndex(std::string_view corner, int vertices, const Scanner& at) {
   for (char c : corner.substr(std::min(corner.find('/'), corner.size())))
     good &= c == '/' || c == '-' || (c >= '0' && c <= '9');
   if (!good)
-    at.failHere("'" + std::string(corner) +
+    at.failHere("'" + std::string(corner.substr(0, 40)) +
                 "' is no face corner; it is written 7, 7/1, 7//1 or 7/1/1");
   const int index = number > 0 ? number - 1 : vertices + number;
   if (number == 0 || index < 0 || index >= vertices)
@@ -308,38 +385,471 @@ int objIndex(std::string_view corner, int vertices, const Scanner& at) {
   return index;
 }
 
-/// The `v` and `f` lines of an OBJ file; polygons become fans, everything else is ignored.
+/// The `v` and `f` lines of an OBJ file; one `o` or `g` name is the label; the rest is ignored.
 TriangleSurface parseObj(const std::string& name, const std::string& text) {
   TriangleSurface S;
-  S.name = fs::path(name).stem().string();
-  Scanner in(name, text);
-  if (in.atEnd()) in.failAsWhole("the file is empty; an OBJ file with v and f lines is needed");
-  Scanner lines(name, text);
-  if (text.compare(0, 3, "\xEF\xBB\xBF") == 0) lines.skip(3);  // a byte order mark
-  std::vector<std::string_view> words;
-  while (!lines.consumed()) {
-    splitWords(lines.line(), words);
-    if (words.empty()) continue;
-    if (words[0] == "v") S.points.push_back(objVertex(words, lines));
-    if (words[0] != "f") continue;
-    if (words.size() < 4)
-      lines.failHere("a face needs three corners, here are " + std::to_string(words.size() - 1) +
-                     "; complete the line or remove it");
-    const int n = static_cast<int>(S.points.size());
-    const int first = objIndex(words[1], n, lines);
-    for (int last = objIndex(words[2], n, lines), i = 3; i < static_cast<int>(words.size()); ++i) {
-      const int next = objIndex(words[i], n, lines);
-      S.triangles.push_back({first, last, next});
-      last = next;
-    }
+  Lines line(name, text);
+  if (Scanner(name, text).atEnd())
+    line.in.failAsWhole("the file is empty; an OBJ file with v and f lines is needed");
+  std::set<std::string> labels;
+  std::vector<int> corners;
+  while (line.next()) {
+    if (line.words[0] == "v") S.points.push_back(line.point(1));
+    if (line.words[0] == "o" || line.words[0] == "g") labels.insert(line.rest());
+    if (line.words[0] != "f") continue;
+    if (line.words.size() < 4) failTooFewCorners(line.in, line.words.size() - 1);
+    corners.clear();
+    for (std::size_t i = 1; i < line.words.size(); ++i)
+      corners.push_back(objIndex(line.words[i], static_cast<int>(S.points.size()), line.in));
+    addPolygon(S, corners);
   }
   if (S.triangles.empty())
-    lines.failAsWhole("no triangle in it (" + std::to_string(S.points.size()) +
-                      " vertices, no f line); is it a Wavefront OBJ file?");
+    line.in.failAsWhole("no triangle in it (" + std::to_string(S.points.size()) +
+                        " vertices, no f line); is it a Wavefront OBJ file?");
+  S.name = labels.size() == 1 && !labels.begin()->empty() ? *labels.begin() : stemOf(name);
   return S;
 }
 
-TriangleSurface readSurface(const std::string& path) { return parseObj(path, readFile(path)); }
+/// OFF with its variants COFF, NOFF, STOFF: what follows the coordinates and corners is ignored.
+TriangleSurface parseOff(const std::string& name, const std::string& text) {
+  TriangleSurface S;
+  S.name = stemOf(name);
+  Lines line(name, text);
+  auto demand = [&](const char* what) {
+    if (!line.next())
+      line.in.failAsWhole(std::string("the file ends where ") + what +
+                          " should be; it is truncated");
+  };
+  demand("OFF");
+  if (line.words.size() > 1 && lower(line.words[1]) == "binary")
+    line.in.failHere("this OFF file is binary; save it as ASCII");
+  const std::size_t first = line.words.size() > 1 ? 1 : 0;  // the counts may be in the first line
+  if (first == 0) demand("the numbers of vertices and faces");
+  const int vertices = line.integer(first, "the number of vertices");
+  const int faces = line.integer(first + 1, "the number of faces");
+  if (vertices < 0 || faces < 1)
+    line.in.failHere("no triangle in it (" + std::to_string(vertices) + " vertices, " +
+                     std::to_string(faces) + " faces); give a surface with faces");
+  for (int i = 0; i < vertices; ++i) {
+    demand("a vertex");
+    S.points.push_back(line.point(0));
+  }
+  std::vector<int> corners;
+  for (int i = 0; i < faces; ++i) {
+    demand("a face");
+    const int count = line.integer(0, "the number of corners");
+    if (count < 3) failTooFewCorners(line.in, std::max(count, 0));
+    corners.clear();
+    for (int k = 1; k <= count; ++k) {
+      corners.push_back(line.integer(k, "a corner of the face"));
+      if (corners.back() < 0 || corners.back() >= vertices)
+        line.in.failHere("the face names vertex " + std::to_string(corners.back()) +
+                         ", the file has " + std::to_string(vertices) +
+                         "; correct the index (they start at 0)");
+    }
+    addPolygon(S, corners);
+  }
+  return S;
+}
+
+/// Each `solid` of an ASCII STL file is a surface; its name counts only where there are several
+/// (that of a single one is mostly the program that wrote it).
+std::vector<TriangleSurface> parseStlAscii(const std::string& name, const std::string& text) {
+  std::vector<TriangleSurface> all;
+  Lines line(name, text);
+  bool open = false;  // a solid
+  std::vector<int> corners;
+  while (line.next()) {
+    const std::string key = lower(line.words[0]);
+    if (key != "solid" && !open)
+      line.in.failHere("'" + key.substr(0, 40) +
+                       "' is outside a solid; put it between solid and endsolid");
+    if (key == "solid") {
+      if (open) line.in.failHere("a solid begins before the last one ended; the file is damaged");
+      open = true;
+      all.push_back({{}, {}, line.rest()});
+    } else if (key == "facet") {
+      corners.clear();
+    } else if (key == "vertex") {
+      corners.push_back(static_cast<int>(all.back().points.size()));
+      all.back().points.push_back(line.point(1));
+    } else if (key == "endfacet") {
+      if (corners.size() < 3) failTooFewCorners(line.in, corners.size());
+      addPolygon(all.back(), corners);
+    } else if (key == "endsolid") {
+      open = false;
+    } else if (key != "outer" && key != "endloop") {
+      line.in.failHere("'" + key.substr(0, 40) +
+                       "' is no keyword of an ASCII STL file; the file is damaged");
+    }
+  }
+  if (open) line.in.failAsWhole("the file ends without endsolid; it is truncated");
+  if (all.size() == 1) all[0].name = stemOf(name);
+  return all;
+}
+
+std::uint32_t littleEndian(const std::string& text, std::size_t at, int bytes) {
+  std::uint32_t value = 0;
+  for (int i = bytes - 1; i >= 0; --i)
+    value = value << 8 | static_cast<unsigned char>(text[at + i]);
+  return value;
+}
+
+float floatAt(const std::string& text, std::size_t at) {
+  const std::uint32_t bits = littleEndian(text, at, 4);
+  float value = 0;
+  std::memcpy(&value, &bits, 4);
+  return value;
+}
+
+[[noreturn]] void failAtByte(const std::string& name, std::size_t at, const std::string& what) {
+  fail(name + ": byte " + std::to_string(at) + ": " + what);
+}
+
+constexpr std::size_t stlHead = 84, stlFacet = 50;  // bytes: 80 of comment and the number of facets
+
+bool isBinaryStl(const std::string& text) {
+  return text.size() >= stlHead &&
+         text.size() == stlHead + stlFacet * std::size_t(littleEndian(text, 80, 4));
+}
+
+TriangleSurface parseStlBinary(const std::string& name, const std::string& text) {
+  if (text.size() < stlHead)
+    failAtByte(name, text.size(), "the file ends in its head of 84 bytes; it is truncated");
+  const std::size_t facets = littleEndian(text, 80, 4);
+  if (!isBinaryStl(text))
+    failAtByte(name, 80,
+               "the head promises " + std::to_string(facets) + " triangles, which are " +
+                   std::to_string(stlHead + stlFacet * facets) + " bytes, and the file has " +
+                   std::to_string(text.size()) + "; it is truncated or damaged");
+  if (facets == 0) failAtByte(name, 80, "no triangle in it; give a surface with triangles");
+  TriangleSurface S;
+  S.name = stemOf(name);
+  for (std::size_t t = 0; t < facets; ++t) {
+    const int first = static_cast<int>(S.points.size());
+    for (int k = 1; k <= 3; ++k) {  // the normal comes first
+      const std::size_t at = stlHead + stlFacet * t + 12 * k;
+      const Vec3 x{floatAt(text, at), floatAt(text, at + 4), floatAt(text, at + 8)};
+      if (!isFinite(x)) failAtByte(name, at, "a coordinate is not finite; correct it");
+      S.points.push_back(x);
+    }
+    S.triangles.push_back({first, first + 1, first + 2});
+  }
+  return S;
+}
+
+/// The values of a PLY file behind its head, one after the other, in either coding.
+class PlyValues {
+ public:
+  enum Type { int8, uint8, int16, uint16, int32, uint32, float32, float64 };
+
+  PlyValues(const std::string& name, const std::string& text, Scanner& in, bool binary)
+      : name_(name), text_(text), in_(in), binary_(binary), at_(in.position()) {}
+  double next(Type type, const char* what) {
+    static constexpr int sizes[] = {1, 1, 2, 2, 4, 4, 4, 8};
+    if (!binary_) return in_.number<double>(what);
+    last_ = at_;
+    at_ += sizes[type];
+    if (at_ > text_.size())
+      failHere(std::string("the file ends where ") + what + " should be; it is truncated");
+    if (type == float32) return floatAt(text_, last_);
+    if (type == float64) {
+      const std::uint64_t high = littleEndian(text_, last_ + 4, 4);
+      const std::uint64_t bits = high << 32 | littleEndian(text_, last_, 4);
+      double value = 0;
+      std::memcpy(&value, &bits, 8);
+      return value;
+    }
+    const double value = littleEndian(text_, last_, sizes[type]);
+    const bool isSigned = type == int8 || type == int16 || type == int32;
+    const double range = std::ldexp(1.0, 8 * sizes[type]);
+    return isSigned && value >= range / 2 ? value - range : value;
+  }
+  /// An integer in [0, below).
+  int index(Type type, double below, const char* what) {
+    const double value = next(type, what);
+    if (!(value >= 0 && value < below && value == std::floor(value)))
+      failHere(format("%.9g", value) + " is " + what + ", it must be an integer from 0 to " +
+               format("%.9g", below - 1));
+    return static_cast<int>(value);
+  }
+  [[noreturn]] void failHere(const std::string& what) const {
+    if (binary_) failAtByte(name_, last_, what);
+    in_.failHere(what);
+  }
+
+ private:
+  const std::string &name_, &text_;
+  Scanner& in_;
+  bool binary_;
+  std::size_t at_, last_ = 0;
+};
+
+struct PlyProperty {
+  std::string name;
+  PlyValues::Type type;
+  bool list;
+  PlyValues::Type countType;
+};
+
+struct PlyElement {
+  std::string name;
+  int count;
+  std::vector<PlyProperty> properties;
+};
+
+PlyValues::Type plyType(std::string_view word, const Scanner& at) {
+  static const std::map<std::string_view, PlyValues::Type> types{
+      {"char", PlyValues::int8},      {"int8", PlyValues::int8},
+      {"uchar", PlyValues::uint8},    {"uint8", PlyValues::uint8},
+      {"short", PlyValues::int16},    {"int16", PlyValues::int16},
+      {"ushort", PlyValues::uint16},  {"uint16", PlyValues::uint16},
+      {"int", PlyValues::int32},      {"int32", PlyValues::int32},
+      {"uint", PlyValues::uint32},    {"uint32", PlyValues::uint32},
+      {"float", PlyValues::float32},  {"float32", PlyValues::float32},
+      {"double", PlyValues::float64}, {"float64", PlyValues::float64}};
+  const auto found = types.find(word);
+  if (found == types.end())
+    at.failHere("'" + std::string(word.substr(0, 40)) +
+                "' is no type of a PLY property; correct the head");
+  return found->second;
+}
+
+/// The elements of the head; the scanner stands behind it then.
+std::vector<PlyElement> readPlyHead(Lines& line, bool& binary) {
+  std::vector<PlyElement> elements;
+  std::string coding;
+  while (line.next() && line.words[0] != "end_header") {
+    const std::vector<std::string_view>& w = line.words;
+    if (w[0] == "format" && w.size() > 1) {
+      coding = w[1];
+      if (coding == "binary_big_endian")
+        line.in.failHere("this PLY file is big-endian; save it as ASCII or binary little-endian");
+      if (coding != "ascii" && coding != "binary_little_endian")
+        line.in.failHere("'" + coding.substr(0, 40) +
+                         "' is no format of a PLY file; save it as ASCII or binary little-endian");
+    } else if (w[0] == "element" && w.size() > 2) {
+      elements.push_back({std::string(w[1]), line.integer(2, "the number of elements"), {}});
+      if (elements.back().count < 0)
+        line.in.failHere("the number of elements is negative; correct it");
+    } else if (w[0] == "property" && !elements.empty() && w.size() > 2 && w[1] != "list") {
+      const PlyValues::Type type = plyType(w[1], line.in);
+      elements.back().properties.push_back({std::string(w[2]), type, false, type});
+    } else if (w[0] == "property" && !elements.empty() && w.size() > 4) {
+      elements.back().properties.push_back(
+          {std::string(w[4]), plyType(w[3], line.in), true, plyType(w[2], line.in)});
+    } else if (w[0] != "ply" && w[0] != "comment" && w[0] != "obj_info") {
+      line.in.failHere("'" + std::string(w[0].substr(0, 40)) +
+                       "' cannot be read in the head of a PLY file; it is damaged");
+    }
+  }
+  if (line.words.empty()) line.in.failAsWhole("the head has no end_header; the file is truncated");
+  if (coding.empty()) line.in.failAsWhole("the head has no format; the file is damaged");
+  binary = coding != "ascii";
+  return elements;
+}
+
+/// A value or a list; the list is returned only where it is asked for.
+void readPlyProperty(PlyValues& values, const PlyProperty& p, double* value, double vertices,
+                     std::vector<int>* corners) {
+  if (!p.list) {
+    const double v = values.next(p.type, "a value");
+    if (value) *value = v;
+    return;
+  }
+  for (int k = values.index(p.countType, INT_MAX, "the length of a list"); k > 0; --k)
+    if (corners)
+      corners->push_back(values.index(p.type, vertices, "the vertex of a face"));
+    else
+      values.next(p.type, "a value");
+}
+
+void demandCoordinates(const PlyElement& vertex, const Scanner& in) {
+  for (const char* axis : {"x", "y", "z"})
+    if (std::none_of(vertex.properties.begin(), vertex.properties.end(),
+                     [&](const PlyProperty& p) { return p.name == axis && !p.list; }))
+      in.failAsWhole(std::string("its vertices have no property ") + axis +
+                     "; x, y and z are needed");
+}
+
+TriangleSurface parsePly(const std::string& name, const std::string& text) {
+  Lines line(name, text);
+  bool binary = false;
+  const std::vector<PlyElement> elements = readPlyHead(line, binary);
+  PlyValues values(name, text, line.in, binary);
+  TriangleSurface S;
+  S.name = stemOf(name);
+  for (const PlyElement& element : elements) {
+    const bool vertex = element.name == "vertex", face = element.name == "face";
+    if (vertex) demandCoordinates(element, line.in);
+    if (!element.properties.empty()) line.in.checkRest(element.count, element.name + " elements");
+    std::vector<int> corners;
+    for (int i = 0; i < element.count && !element.properties.empty(); ++i) {
+      Vec3 x;
+      corners.clear();
+      for (const PlyProperty& p : element.properties) {
+        double* const to = p.name == "x"   ? &x.x
+                           : p.name == "y" ? &x.y
+                           : p.name == "z" ? &x.z
+                                           : nullptr;
+        const bool wanted = face && (p.name == "vertex_indices" || p.name == "vertex_index");
+        readPlyProperty(values, p, to, double(S.points.size()), wanted ? &corners : nullptr);
+      }
+      if (vertex && !isFinite(x)) values.failHere("a coordinate is not finite; correct it");
+      if (vertex) S.points.push_back(x);
+      if (face && corners.size() < 3)
+        values.failHere("a face needs three corners, here are " + std::to_string(corners.size()) +
+                        "; correct or remove it");
+      if (face) addPolygon(S, corners);
+    }
+  }
+  if (S.triangles.empty())
+    line.in.failAsWhole("no triangle in it (" + std::to_string(S.points.size()) +
+                        " vertices, no face element); give a surface with faces");
+  return S;
+}
+
+/// One TSurf object of a GOCAD file: from its first line to END.
+struct GocadObject {
+  TriangleSurface S;
+  std::unordered_map<int, int> point;  // of an id
+  bool inHeader = false, depth = false;
+
+  int pointOf(const Lines& line, std::size_t i) const {
+    const int id = line.integer(i, "the number of a vertex");
+    const auto found = point.find(id);
+    if (found == point.end())
+      line.in.failHere("vertex " + std::to_string(id) +
+                       " is named, and no VRTX or ATOM line above defines it; correct the number");
+    return found->second;
+  }
+  /// A vertex line defines its id by coordinates, an atom by another vertex.
+  void define(const Lines& line, bool atom) {
+    const int id = line.integer(1, "the number of a vertex");
+    const int at = atom ? pointOf(line, 2) : static_cast<int>(S.points.size());
+    if (!atom) S.points.push_back(line.point(2));
+    if (!point.insert({id, at}).second)
+      line.in.failHere("vertex " + std::to_string(id) + " is there twice; renumber one");
+  }
+  void read(const Lines& line) {
+    const std::string_view key = line.words[0];
+    if (key.substr(0, 6) == "HEADER") inHeader = true;
+    if (key == "}") inHeader = false;
+    if (inHeader && key.substr(0, 5) == "name:") {
+      S.name = key.size() > 5 ? std::string(key.substr(5)) + " " : "";
+      S.name += line.rest();
+      while (!S.name.empty() && S.name.back() == ' ') S.name.pop_back();
+    }
+    if (key == "ZPOSITIVE" && line.words.size() > 1) depth = lower(line.words[1]) == "depth";
+    if (key == "VRTX" || key == "PVRTX") define(line, false);
+    if (key == "ATOM" || key == "PATOM") define(line, true);
+    if (key != "TRGL") return;
+    if (line.words.size() < 4) failTooFewCorners(line.in, line.words.size() - 1);
+    S.triangles.push_back({pointOf(line, 1), pointOf(line, 2), pointOf(line, 3)});
+  }
+};
+
+/// The TSurf objects of a GOCAD file, z upward; objects and lines of other kinds are passed over.
+std::vector<TriangleSurface> parseGocad(const std::string& name, const std::string& text,
+                                        std::vector<std::string>& warnings) {
+  std::vector<TriangleSurface> all;
+  Lines line(name, text);
+  GocadObject object;
+  bool open = false, surface = false;
+  while (line.next()) {
+    const std::string_view key = line.words[0];
+    if (key == "GOCAD") {
+      if (open) line.in.failHere("an object begins before the last one had its END; add END there");
+      open = true;
+      surface = line.words.size() > 1 && lower(line.words[1]) == "tsurf";
+      object = GocadObject();
+      object.S.name = stemOf(name);
+    } else if (key == "END" && open && surface) {
+      if (object.S.triangles.empty())
+        line.in.failHere("surface '" + object.S.name + "' has no TRGL line; remove the object");
+      if (object.depth) {
+        for (Vec3& x : object.S.points) x.z = -x.z;
+        warnings.push_back("surface '" + object.S.name + "': ZPOSITIVE Depth, z is negated");
+      }
+      all.push_back(object.S);
+    } else if (open && surface) {
+      object.read(line);
+    }
+    if (key == "END") open = false;
+  }
+  if (open) line.in.failAsWhole("the last object has no END; the file is truncated");
+  if (all.empty()) line.in.failAsWhole("no TSurf object in it; export the surface as TSurf");
+  return all;
+}
+
+// ==== Formats ===================================================================================
+
+enum class Format { none, obj, off, stlAscii, stlBinary, ply, gocad, vtk, msh, medit };
+
+bool isMesh(Format f) { return f == Format::vtk || f == Format::msh || f == Format::medit; }
+
+const char* nameOf(Format f) {
+  constexpr const char* names[] = {"unknown", "OBJ",   "OFF",        "STL",  "STL",
+                                   "PLY",     "TSurf", "VTK legacy", "Gmsh", "MEDIT"};
+  return names[static_cast<int>(f)];
+}
+
+/// What the content is. The suffix decides only where OBJ or STL show nothing of their kind.
+Format formatOf(const std::string& path, const std::string& text) {
+  static const std::pair<Format, const char*> firstWords[] = {
+      {Format::ply, " ply "},
+      {Format::gocad, " gocad "},
+      {Format::medit, " meshversionformatted "},
+      {Format::off, " off coff noff cnoff stoff stcnoff "},
+      {Format::obj, " v vt vn f o g mtllib usemtl "}};
+  if (isBinaryStl(text)) return Format::stlBinary;
+  if (text.compare(0, 14, "# vtk DataFile") == 0) return Format::vtk;
+  Lines line(path, text);
+  const std::string first = line.next() ? lower(line.words[0]) : "";
+  if (first[0] == '$') return Format::msh;
+  for (const auto& [format, words] : firstWords)
+    if (std::string(words).find(" " + first + " ") != std::string::npos) return format;
+  const std::string suffix = lower(fs::path(path).extension().string());
+  const bool binary = text.find('\0') != std::string::npos;
+  if (first == "solid" && !binary) return Format::stlAscii;
+  if (first == "solid" || (suffix == ".stl" && !text.empty())) return Format::stlBinary;
+  return suffix == ".obj" ? Format::obj : Format::none;
+}
+
+/// The surfaces of a file's text, each welded and cleaned; what was mended is warned of.
+std::vector<TriangleSurface> parseSurfaces(const std::string& path, const std::string& text,
+                                           std::vector<std::string>& warnings) {
+  std::vector<TriangleSurface> raw;
+  std::vector<std::string> notes;
+  const Format f = formatOf(path, text);
+  if (f == Format::obj) raw = {parseObj(path, text)};
+  if (f == Format::off) raw = {parseOff(path, text)};
+  if (f == Format::stlAscii) raw = parseStlAscii(path, text);
+  if (f == Format::stlBinary) raw = {parseStlBinary(path, text)};
+  if (f == Format::ply) raw = {parsePly(path, text)};
+  if (f == Format::gocad) raw = parseGocad(path, text, notes);
+  if (isMesh(f))
+    fail(path + ": this is a mesh (" + nameOf(f) + "), and a surface is needed; name a surface");
+  if (f == Format::none)
+    fail(path + ": its content is of no known format; surfaces are read from OBJ, OFF, STL, PLY " +
+         "(ASCII, little-endian) and GOCAD TSurf files");
+  std::vector<TriangleSurface> all;
+  for (const TriangleSurface& S : raw) {
+    const std::size_t before = notes.size();
+    all.push_back(weldSurface(S, notes));
+    if (notes.size() > before) notes.back() += " of surface '" + S.name + "'";
+    if (all.back().triangles.empty())
+      fail(path + ": surface '" + S.name + "' is empty: none of its " +
+           std::to_string(S.triangles.size()) + " triangles has an area; check its coordinates");
+  }
+  for (const std::string& note : notes) warnings.push_back(path + ": " + note);
+  return all;
+}
+
+std::vector<TriangleSurface> readSurfaces(const std::string& path,
+                                          std::vector<std::string>& warnings) {
+  return parseSurfaces(path, readFile(path), warnings);
+}
 
 // ==== ESRI ASCII grids ===========================================================================
 
@@ -361,9 +871,7 @@ AscHeader readAscHeader(Scanner& in) {
   AscHeader header;
   double ignored;
   while (!in.atEnd() && !parse(in.peek(), ignored)) {
-    std::string key = upper(in.word("a key of the header"));
-    for (char& c : key)
-      if (c >= 'A' && c <= 'Z') c = static_cast<char>(c - 'A' + 'a');
+    const std::string key = lower(in.word("a key of the header"));
     if (std::find(std::begin(keys), std::end(keys), key) == std::end(keys))
       in.failHere("'" + key.substr(0, 40) +
                   "' is no key of an ESRI ASCII grid (ncols, nrows, xllcorner or xllcenter, "
@@ -462,37 +970,35 @@ Terrain readTerrain(const std::string& path) { return parseAsc(path, readFile(pa
 Meccano parsePolycube(const std::string& name, const std::string& text) {
   constexpr int farthest = 100000;
   Meccano D;
-  Scanner lines(name, text);
-  std::vector<std::string_view> words;
-  while (!lines.consumed()) {
-    splitWords(lines.line(), words);
-    if (words.empty()) continue;
+  Lines lines(name, text);
+  const std::vector<std::string_view>& words = lines.words;
+  while (lines.next()) {
     const bool corner = words[0] == "corner";
     if (!corner && words[0] != "cube")
-      lines.failHere("'" + std::string(words[0].substr(0, 40)) +
+      lines.in.failHere("'" + std::string(words[0].substr(0, 40)) +
                      "' is no line of a polycube; they are `cube i j k` and `corner i j k  x y z`");
     if (words.size() != (corner ? 7u : 4u))
-      lines.failHere(std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
+      lines.in.failHere(std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
                      ", here are " + std::to_string(words.size() - 1) + " numbers");
     std::array<int, 3> at;
     for (int i = 0; i < 3; ++i)
       if (!parse(words[i + 1], at[i]) || std::abs(at[i]) > farthest)
-        lines.failHere("'" + std::string(words[i + 1].substr(0, 40)) +
+        lines.in.failHere("'" + std::string(words[i + 1].substr(0, 40)) +
                        "' is no integer of the lattice; correct it");
     if (!corner) {
       if (std::find(D.cubes.begin(), D.cubes.end(), at) != D.cubes.end())
-        lines.failHere("this cube is given twice; keep one line");
+        lines.in.failHere("this cube is given twice; keep one line");
       D.cubes.push_back(at);
       continue;
     }
     double x[3];
     for (int i = 0; i < 3; ++i)
       if (!parse(words[i + 4], x[i]) || !std::isfinite(x[i]))
-        lines.failHere("'" + std::string(words[i + 4].substr(0, 40)) +
+        lines.in.failHere("'" + std::string(words[i + 4].substr(0, 40)) +
                        "' is no coordinate; correct it");
     D.corners.push_back({at, {x[0], x[1], x[2]}});
   }
-  if (D.cubes.empty()) lines.failAsWhole("no `cube i j k` line in it; is it a polycube?");
+  if (D.cubes.empty()) lines.in.failAsWhole("no `cube i j k` line in it; is it a polycube?");
   return D;
 }
 
@@ -757,6 +1263,7 @@ void orientSheet(const Mesh& M, std::vector<Face>& faces) {
       }
     }
   }
+  if (M.dimension.empty()) return;
   double area = 0;  // in 𝓤, where 𝓢 turns counter-clockwise
   for (const Face& f : faces) {
     bool known = true;
@@ -785,18 +1292,19 @@ void joinFaces(std::vector<Face>& faces) {
 }
 
 /// The bisection order, the last two vertices swapped where the tetrahedron would be negative in
-/// the computational space. A mesh without that space keeps its order, inverted elements and all.
+/// the computational space. A mesh without that space keeps its order, inverted elements and all,
+/// and its labels where it has any.
 Cells cellsOf(const Mesh& M) {
   constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
   Cells C;
   C.tets = M.tets;
   C.q = qualities(M);
-  if (M.xi.empty()) return C;
+  if (M.faceLabel.empty()) return C;
   std::map<int, std::vector<Face>> inserted, boundary;
   for (std::size_t E = 0; E < M.tets.size(); ++E) {
     std::array<int, 4>& z = C.tets[E];
     std::array<int, 4> label = M.faceLabel[E];
-    if (sixVolumes(M.xi, z) < 0) {
+    if (!M.xi.empty() && sixVolumes(M.xi, z) < 0) {
       std::swap(z[2], z[3]);
       std::swap(label[2], label[3]);
     }
@@ -853,12 +1361,12 @@ void putScalars(Text& out, const char* head, std::size_t count, Value value) {
 void putCellData(Text& out, const Mesh& M, const Cells& C) {
   const std::size_t tets = C.tets.size(), all = tets + C.faces.size();
   out << "CELL_DATA " << static_cast<int>(all) << "\n";
-  if (!M.xi.empty()) {
+  if (!M.faceLabel.empty())
     putScalars(out, "surface int", all,
                [&](std::size_t i) { return i < tets ? 0 : C.faces[i - tets].label; });
+  if (!M.xi.empty())
     putScalars(out, "level int", all,
                [&](std::size_t i) { return i < tets ? int(M.level[i]) : -1; });
-  }
   putScalars(out, "quality double", all,
              [&](std::size_t i) { return i < tets ? C.q[i] : C.faces[i - tets].q; });
 }
@@ -885,6 +1393,80 @@ std::string vtkText(const Mesh& M) {
   putCellData(out, M, C);
   if (!M.xi.empty()) putPointData(out, M);
   return out.take();
+}
+
+// ==== Meshes without a meccano: faces by their groups ===========================================
+
+/// A triangle of a mesh file with the number of its group, > 0.
+struct TaggedFace {
+  std::array<int, 3> nodes;
+  int tag;
+};
+
+/// A mesh as a file has it. Only .vtk files of meccano fill more than M's x, tets and faceLabel,
+/// and the names in M.surfaces and M.patches.
+struct MeshFile {
+  Mesh M;
+  std::vector<int> required;  // nodes that stay where they are: MEDIT's RequiredVertices
+  std::vector<std::string> warnings;
+};
+
+/// Labels the faces that the file's triangles name: groups inside the mesh become surfaces 1, 2,
+/// ..., groups on its boundary patches 1, 2, ..., both in the order of their numbers.
+void labelByTags(MeshFile& file, std::vector<TaggedFace> faces,
+                 const std::map<int, std::string>& names = {}) {
+  if (faces.empty()) return;
+  Mesh& M = file.M;
+  std::vector<char> used(M.x.size(), 0);
+  for (TaggedFace& f : faces) {
+    for (int n : f.nodes) used[n] = 1;
+    std::sort(f.nodes.begin(), f.nodes.end());
+  }
+  const auto less = [](const TaggedFace& a, const TaggedFace& b) { return a.nodes < b.nodes; };
+  std::stable_sort(faces.begin(), faces.end(), less);
+  std::vector<char> found(faces.size(), 0);
+  const std::vector<std::array<int, 4>> neighbour = faceNeighbours(M);
+  M.faceLabel.assign(M.tets.size(), {0, 0, 0, 0});
+  std::map<int, int> surfaces, patches;  // tag -> number
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      const std::array<int, 4>& z = M.tets[E];
+      TaggedFace key{{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]}, 0};
+      if (!used[key.nodes[0]] || !used[key.nodes[1]] || !used[key.nodes[2]]) continue;
+      std::sort(key.nodes.begin(), key.nodes.end());
+      const auto at = std::lower_bound(faces.begin(), faces.end(), key, less);
+      if (at == faces.end() || at->nodes != key.nodes) continue;
+      found[at - faces.begin()] = 1;
+      M.faceLabel[E][i] = neighbour[E][i] < 0 ? -at->tag : at->tag;
+      (neighbour[E][i] < 0 ? patches : surfaces)[at->tag] = 0;
+    }
+  const auto number = [&](std::map<int, int>& tags, std::vector<Parametrization>& list,
+                          const char* word) {
+    for (auto& [tag, n] : tags) {
+      n = static_cast<int>(list.size()) + 1;
+      list.emplace_back();
+      list.back().name = names.count(tag) ? names.at(tag) : word + std::to_string(n);
+    }
+  };
+  number(surfaces, M.surfaces, "surface ");
+  number(patches, M.patches, "patch ");
+  for (std::array<int, 4>& labels : M.faceLabel)
+    for (int& label : labels)
+      label = label < 0 ? -patches[-label] : label > 0 ? surfaces[label] : 0;
+  if (surfaces.empty() && patches.empty()) M.faceLabel.clear();
+  const auto strays = std::count(found.begin(), found.end(), 0);
+  if (strays > 0)
+    file.warnings.push_back(std::to_string(strays) +
+                            " triangles are no faces of its tetrahedra, or there twice: left out");
+}
+
+Vec3 readPoint(Scanner& in) {
+  Vec3 x;
+  x.x = in.number<double>("a coordinate");
+  x.y = in.number<double>("a coordinate");
+  x.z = in.number<double>("a coordinate");
+  if (!isFinite(x)) in.failHere("a coordinate is not finite; correct it");
+  return x;
 }
 
 // ==== VTK legacy: reading =======================================================================
@@ -926,12 +1508,7 @@ void readPoints(Scanner& in, VtkFile& file) {
   const int count = in.count("points");
   in.word("the type of the points");
   file.points.resize(count);
-  for (Vec3& x : file.points) {
-    x.x = in.number<double>("a coordinate");
-    x.y = in.number<double>("a coordinate");
-    x.z = in.number<double>("a coordinate");
-    if (!isFinite(x)) in.failHere("a coordinate is not finite; correct it");
-  }
+  for (Vec3& x : file.points) x = readPoint(in);
 }
 
 int readNode(Scanner& in, const VtkFile& file) {
@@ -1178,7 +1755,26 @@ void readNodes(const VtkFile& file, Mesh& M, const Scanner& in) {
   }
 }
 
-/// A mesh from a VTK legacy file: with its meccano where the file has one, else x and tets alone.
+/// The triangles of a file without a meccano by its array `surface`, where that is one of labels.
+void labelPlain(const VtkFile& file, Mesh& M) {
+  constexpr int triangle = 5;
+  const auto found = file.cellData.find("surface");
+  if (found == file.cellData.end() || found->second.components != 1) return;
+  MeshFile labelled;
+  std::vector<TaggedFace> faces;
+  for (std::size_t c = 0; c < file.types.size(); ++c) {
+    const double label = std::abs(found->second.values[c]);
+    const bool good = label >= 1 && label < INT_MAX && label == std::floor(label);
+    const int* n = &file.nodes[file.start[c]];
+    if (good && file.types[c] == triangle && file.start[c + 1] - file.start[c] == 3)
+      faces.push_back({{n[0], n[1], n[2]}, static_cast<int>(label)});
+  }
+  std::swap(labelled.M, M);
+  labelByTags(labelled, faces);
+  std::swap(labelled.M, M);
+}
+
+/// A mesh from a VTK legacy file: with its meccano where the file has one, else x, tets and labels.
 Mesh parseVtk(const std::string& name, const std::string& text) {
   Scanner in(name, text);
   const bool version5 = text.compare(0, 24, "# vtk DataFile Version 5") == 0;
@@ -1187,7 +1783,10 @@ Mesh parseVtk(const std::string& name, const std::string& text) {
   Mesh M;
   M.x = file.points;
   const std::vector<int> cell = takeTetrahedra(file, M, in);
-  if (!file.field.count("cube") && !file.pointData.count("computational")) return M;
+  if (!file.field.count("cube") && !file.pointData.count("computational")) {
+    labelPlain(file, M);
+    return M;
+  }
   if (text.back() != '\n') in.failAsWhole("the last line is not complete; the file is truncated");
   Unpacking cube(file.field, "cube", 3, in);
   M.cube = cube.vec3();
@@ -1208,15 +1807,473 @@ Mesh parseVtk(const std::string& name, const std::string& text) {
   return M;
 }
 
-/// As parseVtk; the errors of the library's own checks get the file's name.
-Mesh readMesh(const std::string& path) {
+// ==== Meshes without a meccano: labels ==========================================================
+
+/// The nodes of labelled faces inside a mesh that has no geometry for them.
+std::vector<int> interfaceNodes(const Mesh& M) {
+  std::vector<int> nodes;
+  if (!M.dimension.empty()) return nodes;
+  for (int k = 1; k <= static_cast<int>(M.surfaces.size()); ++k)
+    for (const std::array<int, 3>& f : surfaceFaces(M, k))
+      nodes.insert(nodes.end(), f.begin(), f.end());
+  std::sort(nodes.begin(), nodes.end());
+  nodes.erase(std::unique(nodes.begin(), nodes.end()), nodes.end());
+  return nodes;
+}
+
+/// The name of the surface or patch with this label, as other programs see it.
+std::string labelName(const Mesh& M, int label) {
+  const std::vector<Parametrization>& list = label > 0 ? M.surfaces : M.patches;
+  const std::size_t k = std::abs(label);
+  if (k <= list.size() && !list[k - 1].name.empty()) return list[k - 1].name;
+  return (label > 0 ? "surface " : "patch ") + std::to_string(k);
+}
+
+/// Group numbers in .msh and .mesh, all > 0: surfaces keep theirs, the patches follow.
+int surfaceGroups(const Mesh& M, const Cells& C) {
+  int highest = static_cast<int>(M.surfaces.size());
+  for (const Face& f : C.faces) highest = std::max(highest, f.label);
+  return highest;
+}
+
+int groupOf(int label, int surfaces) { return label > 0 ? label : surfaces - label; }
+
+/// A tetrahedron of a file; its vertices are four nodes.
+void addTetrahedron(Mesh& M, const std::array<int, 4>& z, const Scanner& in) {
+  for (int i = 0; i < 4; ++i)
+    for (int j = 0; j < i; ++j)
+      if (z[i] == z[j])
+        in.failHere("tetrahedron " + std::to_string(M.tets.size()) +
+                    " names a node twice; correct the mesh");
+  M.tets.push_back(z);
+}
+
+// ==== Gmsh MSH 2.2 ==============================================================================
+
+constexpr int gmshTriangle = 2, gmshTetrahedron = 4;
+
+/// ASCII 2.2: a physical group with its name for the volume, each surface and each patch.
+std::string mshText(const Mesh& M) {
+  const Cells C = cellsOf(M);
+  const int surfaces = surfaceGroups(M, C);
+  std::set<int> labels;
+  for (const Face& f : C.faces) labels.insert(f.label);
+  Text out;
+  out << "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n"
+      << static_cast<int>(labels.size()) + 1 << "\n";
+  std::map<int, int> inOrder;  // group -> label
+  for (int label : labels) inOrder[groupOf(label, surfaces)] = label;
+  std::set<std::string> taken{"volume"};
+  for (const auto& [group, label] : inOrder) {
+    std::string name = labelName(M, label);
+    for (char& c : name)
+      if (c == '"' || static_cast<unsigned char>(c) < ' ') c = '\'';
+    if (!taken.insert(name).second) name += " (" + std::to_string(group) + ")";
+    out << "2 " << group << " \"" << name << "\"\n";
+  }
+  out << "3 1 \"volume\"\n$EndPhysicalNames\n$Nodes\n" << static_cast<int>(M.x.size()) << "\n";
+  for (std::size_t n = 0; n < M.x.size(); ++n)
+    out << static_cast<int>(n) + 1 << " " << M.x[n].x << " " << M.x[n].y << " " << M.x[n].z << "\n";
+  out << "$EndNodes\n$Elements\n" << static_cast<int>(C.faces.size() + C.tets.size()) << "\n";
+  int element = 0;  // number, element type, two tags (physical group, geometric entity), nodes
+  for (const Face& f : C.faces) {
+    const int group = groupOf(f.label, surfaces);
+    out << ++element << " " << gmshTriangle << " 2 " << group << " " << group;
+    for (int n : f.nodes) out << " " << n + 1;
+    out << "\n";
+  }
+  for (const std::array<int, 4>& z : C.tets) {
+    out << ++element << " " << gmshTetrahedron << " 2 1 1";
+    for (int n : z) out << " " << n + 1;
+    out << "\n";
+  }
+  out << "$EndElements\n";
+  return out.take();
+}
+
+/// What is read of a .msh file; nodes have numbers of any kind in it.
+struct MshReader {
+  MeshFile file;
+  std::unordered_map<int, int> node;  // of a number
+  std::vector<TaggedFace> faces;
+  std::map<int, std::string> names;  // of two-dimensional groups
+  std::set<int> regions;
+
+  void head(Scanner& in) {
+    const double version = in.number<double>("the version");
+    const int binary = in.number<int>("the file type");
+    in.number<int>("the size of a number");
+    if (version < 2 || version >= 3 || binary != 0)
+      in.failHere("this Gmsh file is " + std::string(binary ? "binary" : "ASCII") + " version " +
+                  format("%.2g", version) +
+                  "; save it as ASCII version 2.2 (gmsh -save -format msh22)");
+  }
+  void physicalNames(Scanner& in) {
+    for (int i = in.count("physical names"); i > 0; --i) {
+      const int dimension = in.number<int>("a dimension"), tag = in.number<int>("a group");
+      const std::string_view rest = in.line();
+      const std::size_t from = rest.find('"'), to = rest.rfind('"');
+      if (from == to) in.failHere("a physical name is written in \"quotes\"; add them");
+      if (dimension == 2) names[tag] = rest.substr(from + 1, to - from - 1);
+    }
+  }
+  void nodes(Scanner& in) {
+    for (int i = in.count("nodes"); i > 0; --i) {
+      const int number = in.number<int>("the number of a node");
+      if (!node.insert({number, static_cast<int>(file.M.x.size())}).second)
+        in.failHere("node " + std::to_string(number) + " is there twice; renumber one");
+      file.M.x.push_back(readPoint(in));
+    }
+  }
+  int readNode(Scanner& in) {
+    const int number = in.number<int>("a node");
+    const auto found = node.find(number);
+    if (found == node.end())
+      in.failHere("node " + std::to_string(number) +
+                  " does not exist; correct the number, or put $Nodes before $Elements");
+    return found->second;
+  }
+  void elements(Scanner& in) {
+    constexpr int flat[] = {1, 2, 3, 8, 9, 10, 15, 16, 20, 21, 26};  // points, lines and faces
+    for (int i = in.count("elements"); i > 0; --i) {
+      in.number<int>("the number of an element");
+      const int type = in.number<int>("the type of an element");
+      int group = 0;
+      for (int tags = in.count("tags"), t = 0; t < tags; ++t) {
+        const int tag = in.number<int>("a tag");
+        if (t == 0 || (t == 1 && group == 0)) group = tag;  // physical, else geometric
+      }
+      if (type == gmshTetrahedron) {
+        const int a = readNode(in), b = readNode(in), c = readNode(in);
+        addTetrahedron(file.M, {a, b, c, readNode(in)}, in);
+        regions.insert(group);
+      } else if (type == gmshTriangle) {
+        const int a = readNode(in), b = readNode(in);
+        const TaggedFace f{{a, b, readNode(in)}, group};
+        if (group > 0) faces.push_back(f);
+      } else if (std::find(std::begin(flat), std::end(flat), type) == std::end(flat)) {
+        in.failHere("an element of type " + std::to_string(type) +
+                    "; only tetrahedra of four nodes (type 4) can be treated");
+      } else {
+        in.line();
+      }
+    }
+  }
+};
+
+void checkTetrahedra(MeshFile& file, const std::set<int>& regions, const Scanner& in) {
+  if (file.M.tets.empty()) in.failAsWhole("no tetrahedron in it; a tetrahedral mesh is needed");
+  if (regions.size() > 1)
+    file.warnings.push_back("its " + std::to_string(regions.size()) +
+                            " regions of tetrahedra become one: regions are not kept");
+}
+
+MeshFile parseMsh(const std::string& name, const std::string& text) {
+  Scanner in(name, text);
+  if (hasByteOrderMark(text)) in.skip(3);
+  MshReader r;
+  while (!in.atEnd()) {
+    const std::string section(in.word("a section"));
+    if (section[0] != '$')
+      in.failHere("'" + section.substr(0, 40) + "' is where a section ($...) should be");
+    if (section == "$MeshFormat")
+      r.head(in);
+    else if (section == "$PhysicalNames")
+      r.physicalNames(in);
+    else if (section == "$Nodes")
+      r.nodes(in);
+    else if (section == "$Elements")
+      r.elements(in);
+    const std::string end = "$End" + section.substr(1);
+    const bool known = section == "$MeshFormat" || section == "$PhysicalNames" ||
+                       section == "$Nodes" || section == "$Elements";
+    std::string_view word = in.word(end.c_str());
+    while (!known && word != end) word = in.word(end.c_str());
+    if (word != end)
+      in.failHere("'" + std::string(word.substr(0, 40)) + "' is where " + end + " should be");
+  }
+  checkTetrahedra(r.file, r.regions, in);
+  labelByTags(r.file, r.faces, r.names);
+  return std::move(r.file);
+}
+
+// ==== MEDIT .mesh ===============================================================================
+
+/// Version 2 (double precision): references of triangles are the groups, of tetrahedra 1.
+std::string meditText(const Mesh& M, const std::vector<int>& required) {
+  const Cells C = cellsOf(M);
+  const int surfaces = surfaceGroups(M, C);
+  Text out;
+  out << "MeshVersionFormatted 2\n\nDimension 3\n\nVertices\n"
+      << static_cast<int>(M.x.size()) << "\n";
+  for (Vec3 x : M.x) out << x.x << " " << x.y << " " << x.z << " 0\n";
+  out << "\nTetrahedra\n" << static_cast<int>(C.tets.size()) << "\n";
+  for (const std::array<int, 4>& z : C.tets) {
+    for (int n : z) out << n + 1 << " ";
+    out << "1\n";
+  }
+  if (!C.faces.empty()) out << "\nTriangles\n" << static_cast<int>(C.faces.size()) << "\n";
+  for (const Face& f : C.faces) {
+    for (int n : f.nodes) out << n + 1 << " ";
+    out << groupOf(f.label, surfaces) << "\n";
+  }
+  std::vector<int> corners;
+  for (std::size_t n = 0; n < M.dimension.size(); ++n)
+    if (M.dimension[n] == 0) corners.push_back(static_cast<int>(n));
+  const std::pair<const char*, const std::vector<int>*> lists[] = {{"Corners", &corners},
+                                                                   {"RequiredVertices", &required}};
+  for (const auto& [head, nodes] : lists) {
+    if (!nodes->empty()) out << "\n" << head << "\n" << static_cast<int>(nodes->size()) << "\n";
+    for (int n : *nodes) out << n + 1 << "\n";
+  }
+  out << "\nEnd\n";
+  return out.take();
+}
+
+int meditNode(Scanner& in, const Mesh& M) {
+  const int n = in.number<int>("a node"), count = static_cast<int>(M.x.size());
+  if (n < 1 || n > count)
+    in.failHere("node " + std::to_string(n) + " does not exist, there are " +
+                std::to_string(count) + " vertices; correct the index (they start at 1)");
+  return n - 1;
+}
+
+/// The entries of a section; what is no vertex, tetrahedron, triangle or required vertex is
+/// skipped.
+void readMeditSection(Scanner& in, const std::string& key, MeshFile& file,
+                      std::vector<TaggedFace>& faces, std::set<int>& regions) {
+  Mesh& M = file.M;
+  const bool solid = key.compare(0, 4, "Hexa") == 0 || key.compare(0, 5, "Prism") == 0 ||
+                     key.compare(0, 7, "Pyramid") == 0 || key.compare(0, 12, "TetrahedraP2") == 0;
+  if (solid)
+    in.failHere(key.substr(0, 40) + " are in it; only tetrahedra of four nodes can be treated");
+  int count =
+      key == "Vertices" || key == "Tetrahedra" || key == "Triangles" || key == "RequiredVertices"
+          ? in.count("entries of a section")
+          : 0;
+  for (; count > 0; --count) {
+    if (key == "RequiredVertices") {
+      file.required.push_back(meditNode(in, M));
+      continue;
+    }
+    if (key == "Vertices") {
+      M.x.push_back(readPoint(in));
+    } else {
+      const int a = meditNode(in, M), b = meditNode(in, M), c = meditNode(in, M);
+      if (key == "Triangles") faces.push_back({{a, b, c}, 0});
+      if (key == "Tetrahedra") addTetrahedron(M, {a, b, c, meditNode(in, M)}, in);
+    }
+    const int reference = in.number<int>("a reference");
+    if (key == "Tetrahedra") regions.insert(reference);
+    if (key == "Triangles") faces.back().tag = reference;
+  }
+}
+
+MeshFile parseMedit(const std::string& name, const std::string& text) {
+  Scanner in(name, text, '#');
+  if (hasByteOrderMark(text)) in.skip(3);
+  MeshFile file;
+  std::vector<TaggedFace> faces;
+  std::set<int> regions;
+  in.word("MeshVersionFormatted");
+  in.number<int>("the version");
+  bool ended = false;
+  while (!ended && !in.atEnd()) {
+    const std::string key(in.word("a section"));
+    const bool isWord = (key[0] >= 'A' && key[0] <= 'Z') || (key[0] >= 'a' && key[0] <= 'z');
+    if (!isWord) continue;  // numbers of a section that is skipped
+    ended = key == "End";
+    if (key == "Dimension" && in.number<int>("the dimension") != 3)
+      in.failHere("the dimension is not 3; a tetrahedral mesh is needed");
+    readMeditSection(in, key, file, faces, regions);
+  }
+  if (!ended) in.failAsWhole("the file has no End; it is truncated");
+  checkTetrahedra(file, regions, in);
+  const auto none = [](const TaggedFace& f) { return f.tag <= 0; };
+  faces.erase(std::remove_if(faces.begin(), faces.end(), none), faces.end());
+  labelByTags(file, faces);
+  return file;
+}
+
+// ==== Meshes and surfaces by their format =======================================================
+
+MeshFile parseMesh(const std::string& path, const std::string& text) {
+  const Format f = formatOf(path, text);
+  if (f == Format::msh) return parseMsh(path, text);
+  if (f == Format::medit) return parseMedit(path, text);
+  if (f == Format::vtk || text.find_first_not_of(" \t\r\n") == std::string::npos) {
+    MeshFile file;
+    file.M = parseVtk(path, text);
+    return file;
+  }
+  if (f != Format::none)
+    fail(path + ": this is a surface (" + nameOf(f) + "), and a mesh is needed; name a mesh");
+  fail(path +
+       ": its content is of no known format; meshes are read from VTK legacy, Gmsh 2.2 and " +
+       "MEDIT files, all ASCII");
+}
+
+/// The errors of the library's own checks get the file's name.
+MeshFile readMeshFile(const std::string& path) {
   const std::string text = readFile(path);
   try {
-    return parseVtk(path, text);
+    MeshFile file = parseMesh(path, text);
+    for (std::string& w : file.warnings) w = path + ": " + w;
+    return file;
   } catch (const Error& e) {
     const std::string what = e.what();
     throw InputError(what.compare(0, path.size(), path) == 0 ? what : path + ": " + what);
   }
+}
+
+Mesh readMesh(const std::string& path) { return readMeshFile(path).M; }
+
+constexpr const char* meshSuffixes = ".vtk, .msh or .mesh";
+constexpr const char* surfaceSuffixes = ".obj, .stl, .off, .ply or .ts";
+
+std::string suffixOf(const std::string& path) { return lower(fs::path(path).extension().string()); }
+
+bool isMeshSuffix(const std::string& s) { return s == ".vtk" || s == ".msh" || s == ".mesh"; }
+bool isSurfaceSuffix(const std::string& s) {
+  return s == ".obj" || s == ".stl" || s == ".off" || s == ".ply" || s == ".ts";
+}
+
+/// The mesh in the format of the path's suffix; a device gets VTK.
+std::string meshText(const std::string& path, const Mesh& M,
+                     const std::vector<int>& required = {}) {
+  const std::string suffix = suffixOf(path);
+  if (suffix == ".msh") return mshText(M);
+  if (suffix == ".mesh") return meditText(M, required);
+  return vtkText(M);
+}
+
+// ---- surfaces out ------------------------------------------------------------------------------
+
+/// All in one, as formats of one object need it.
+TriangleSurface joined(const std::vector<TriangleSurface>& all) {
+  TriangleSurface S;
+  for (const TriangleSurface& part : all) {
+    const int first = static_cast<int>(S.points.size());
+    S.points.insert(S.points.end(), part.points.begin(), part.points.end());
+    for (const std::array<int, 3>& t : part.triangles)
+      S.triangles.push_back({first + t[0], first + t[1], first + t[2]});
+  }
+  return S;
+}
+
+std::string objText(const std::vector<TriangleSurface>& all) {
+  Text out;
+  int first = 1;
+  for (const TriangleSurface& S : all) {
+    out << "o " << S.name << "\n";
+    for (Vec3 x : S.points) out << "v " << x.x << " " << x.y << " " << x.z << "\n";
+    for (const std::array<int, 3>& t : S.triangles)
+      out << "f " << first + t[0] << " " << first + t[1] << " " << first + t[2] << "\n";
+    first += static_cast<int>(S.points.size());
+  }
+  return out.take();
+}
+
+std::string gocadText(const std::vector<TriangleSurface>& all) {
+  Text out;
+  for (const TriangleSurface& S : all) {
+    out << "GOCAD TSurf 1\nHEADER {\nname:" << S.name << "\n}\n"
+        << "GOCAD_ORIGINAL_COORDINATE_SYSTEM\nNAME Default\nAXIS_NAME \"X\" \"Y\" \"Z\"\n"
+        << "ZPOSITIVE Elevation\nEND_ORIGINAL_COORDINATE_SYSTEM\nTFACE\n";
+    int id = 0;
+    for (Vec3 x : S.points)
+      out << "VRTX " << ++id << " " << x.x << " " << x.y << " " << x.z << "\n";
+    for (const std::array<int, 3>& t : S.triangles)
+      out << "TRGL " << t[0] + 1 << " " << t[1] + 1 << " " << t[2] + 1 << "\n";
+    out << "END\n";
+  }
+  return out.take();
+}
+
+/// OFF and ASCII PLY: a head, the points, the triangles.
+std::string listText(const std::string& head, const TriangleSurface& S) {
+  Text out;
+  out << head;
+  for (Vec3 x : S.points) out << x.x << " " << x.y << " " << x.z << "\n";
+  for (const std::array<int, 3>& t : S.triangles)
+    out << "3 " << t[0] << " " << t[1] << " " << t[2] << "\n";
+  return out.take();
+}
+
+void putLittleEndian(std::string& text, std::uint32_t value, int bytes) {
+  for (int i = 0; i < bytes; ++i) text += static_cast<char>(value >> 8 * i & 255);
+}
+
+std::string stlText(const TriangleSurface& S) {
+  std::string text = "binary STL written by meccano";
+  text.resize(80, ' ');
+  putLittleEndian(text, static_cast<std::uint32_t>(S.triangles.size()), 4);
+  for (const std::array<int, 3>& t : S.triangles) {
+    const Vec3 a = S.points[t[0]], b = S.points[t[1]], c = S.points[t[2]];
+    const Vec3 normal = cross(b - a, c - a);
+    const double length = norm(normal);
+    for (Vec3 x : {length > 0 ? (1 / length) * normal : Vec3{}, a, b, c})
+      for (double v : {x.x, x.y, x.z}) {
+        const float f = static_cast<float>(v);
+        std::uint32_t bits = 0;
+        std::memcpy(&bits, &f, 4);
+        putLittleEndian(text, bits, 4);
+      }
+    putLittleEndian(text, 0, 2);
+  }
+  return text;
+}
+
+/// Surfaces in the format of the path's suffix; what it cannot hold is warned of.
+std::string surfaceText(const std::string& path, const std::vector<TriangleSurface>& all,
+                        std::vector<std::string>& warnings) {
+  const std::string suffix = suffixOf(path);
+  if (suffix == ".obj") return objText(all);
+  if (suffix == ".ts") return gocadText(all);
+  if (all.size() > 1)
+    warnings.push_back(path + ": its " + std::to_string(all.size()) +
+                       " surfaces are written as one; .ts and .obj keep them apart");
+  const TriangleSurface S = joined(all);
+  const std::string points = std::to_string(S.points.size());
+  const std::string triangles = std::to_string(S.triangles.size());
+  if (suffix == ".off") return listText("OFF\n" + points + " " + triangles + " 0\n", S);
+  if (suffix == ".ply")
+    return listText("ply\nformat ascii 1.0\nelement vertex " + points +
+                        "\nproperty double x\nproperty double y\nproperty double z\nelement face " +
+                        triangles + "\nproperty list uchar int vertex_indices\nend_header\n",
+                    S);
+  double change = 0;
+  for (Vec3 x : S.points)
+    for (double v : {x.x, x.y, x.z}) change = std::max(change, std::abs(v - double(float(v))));
+  if (!std::isfinite(change)) fail(path + ": a coordinate is too large for STL; write .obj or .ts");
+  if (change > 0)
+    warnings.push_back(path + ": STL has single precision, coordinates change by up to " +
+                       format("%.2g", change) + "; .obj, .off, .ply and .ts keep them");
+  return stlText(S);
+}
+
+/// The inserted surfaces of a mesh, S_M: one for each label.
+std::vector<TriangleSurface> insertedSurfaces(const std::string& path, const Mesh& M) {
+  std::vector<TriangleSurface> all;
+  std::map<int, int> point;  // of a node, in the surface at hand
+  int label = 0;
+  for (const Face& f : cellsOf(M).faces) {
+    if (f.label < 0) continue;
+    if (f.label != label) {
+      label = f.label;
+      all.push_back({{}, {}, labelName(M, label)});
+      point.clear();
+    }
+    std::array<int, 3> t{};
+    for (int i = 0; i < 3; ++i) {
+      const auto [at, isNew] = point.insert({f.nodes[i], static_cast<int>(point.size())});
+      if (isNew) all.back().points.push_back(M.x[f.nodes[i]]);
+      t[i] = at->second;
+    }
+    all.back().triangles.push_back(t);
+  }
+  if (all.empty()) fail(path + ": no surface is inserted in this mesh; write it as a mesh");
+  return all;
 }
 
 // ==== Arguments =================================================================================
@@ -1253,13 +2310,14 @@ struct Arguments {
     return {number(name, otherwise.x, 0), number(name, otherwise.y, 1),
             number(name, otherwise.z, 2)};
   }
-  /// The mesh to write: a .vtk file, or a device.
+  /// The mesh to write: a file of a known suffix, or a device.
   std::string output() const {
     const auto found = options.find("-o");
-    if (found == options.end()) throw UsageError("the output is missing: -o OUT.vtk");
+    if (found == options.end()) throw UsageError("the output is missing: -o OUT");
     const std::string& path = found->second[0];
-    if (fs::path(path).extension() != ".vtk" && !isDevice(path))
-      throw UsageError("'" + path + "' does not end in .vtk, the format of the output");
+    if (!isMeshSuffix(suffixOf(path)) && !isDevice(path))
+      throw UsageError("'" + path + "' does not end in " + meshSuffixes +
+                       ", the formats of the output");
     return path;
   }
 };
@@ -1342,7 +2400,7 @@ void runBox(const Arguments& a, const Streams& io) {
   const Vec3 origin = a.vec3("--origin", {0, 0, 0}), size = a.vec3("--size", {1, 1, 1});
   checkWritable(path);
   const Mesh M = boxMesh(origin, size, cells);
-  writeFiles({{path, vtkText(M)}});
+  writeFiles({{path, meshText(path, M)}});
   io.err << path << ": " << sizeOf(M) << std::endl;
 }
 
@@ -1409,7 +2467,13 @@ void runSolid(const Arguments& a, const Streams& io) {
   MesherOptions options = mesherOptions(a, progress);
   if (!(options.eps > 0)) throw UsageError("--eps must be above 0");
   checkWritable(path);
-  const TriangleSurface S = readSurface(a.operands[0]);
+  std::vector<std::string> warnings;
+  const std::vector<TriangleSurface> all = readSurfaces(a.operands[0], warnings);
+  for (const std::string& warning : warnings) progress.line("warning: " + warning);
+  if (all.size() != 1)
+    fail(a.operands[0] + ": holds " + std::to_string(all.size()) +
+         " surfaces, and the boundary of one solid is needed; keep one");
+  const TriangleSurface& S = all[0];
   if (a.has("--polycube")) {
     const std::string& file = a.options.at("--polycube")[0];
     options.meccano = parsePolycube(file, readFile(file));
@@ -1425,8 +2489,8 @@ void runSolid(const Arguments& a, const Streams& io) {
 void checkInsertable(const std::string& path, const Mesh& M) {
   if (M.xi.empty())
     fail(path +
-         ": the mesh has no computational coordinates, and bisection needs them; start from "
-         "`meccano box` or a .vtk file that meccano wrote");
+         ": the mesh has no computational coordinates, and bisection needs them; only .vtk keeps "
+         "the meccano: start from `meccano box` or a .vtk file that meccano wrote");
   int highest = 0;
   for (const std::array<int, 4>& labels : M.faceLabel)
     for (int label : labels) highest = std::max(highest, label);
@@ -1436,17 +2500,21 @@ void checkInsertable(const std::string& path, const Mesh& M) {
          "as in the stages of an insertion; insert into a finished mesh");
 }
 
-void printInsertion(const InsertReport& r, const std::string& name, const Streams& io) {
-  io.out << tableI({{"original", &r.original},
-                    {"refined", &r.refined},
-                    {"projected", &r.projected},
-                    {"smoothed", &r.smoothed}})
-         << regularLine(r.regular)
-         << format(
-                "surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
-                "%.3g, Hausdorff distance %.3g\n",
-                r.surface, name.c_str(), r.lc, r.nodes, r.triangles, r.maxNodeDistance,
-                r.hausdorff);
+/// Table I: the mesh before the first surface and after the last, refined and projected for the
+/// last as in Figure 12; then a line for each surface as it is at the end.
+void printInsertion(const std::vector<InsertReport>& reports, const Mesh& M, const Streams& io) {
+  const InsertReport& last = reports.back();
+  io.out << tableI({{"original", &reports.front().original},
+                    {"refined", &last.refined},
+                    {"projected", &last.projected},
+                    {"smoothed", &last.smoothed}})
+         << regularLine(last.regular);
+  for (const InsertReport& r : reports)
+    io.out << format(
+        "surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
+        "%.3g, Hausdorff distance %.3g\n",
+        r.surface, M.surfaces[r.surface - 1].name.c_str(), r.lc, r.nodes, r.triangles,
+        r.maxNodeDistance, r.hausdorff);
 }
 
 InsertOptions insertOptions(const Arguments& a) {
@@ -1458,34 +2526,67 @@ InsertOptions insertOptions(const Arguments& a) {
 }
 
 /// The files of --stages PREFIX. Stages come once for each way of inserting that is tried; those of
-/// the way that was taken are written.
+/// the way that was taken are written. With several surfaces their number follows the prefix:
+/// PREFIX-2-projected.vtk.
 struct Stages {
   std::string prefix;  // empty: none are kept
-  int way = 0;
-  std::vector<std::pair<int, Output>> kept;  // with the way, 0: all
+  bool several = false;
+  int surface = 0, way = 0;  // under way
+  struct Kept {
+    int surface, way;  // 0: whichever
+    Output output;
+  };
+  std::vector<Kept> kept = {};
 
-  void keep(const char* name, const Mesh& M, int ofWay) {
-    if (!prefix.empty()) kept.push_back({ofWay, {prefix + "-" + name + ".vtk", vtkText(M)}});
+  void keep(const std::string& name, const Mesh& M, int ofSurface, int ofWay) {
+    if (!prefix.empty())
+      kept.push_back({ofSurface, ofWay, {prefix + '-' + name + ".vtk", vtkText(M)}});
   }
   void see(const std::string& stage, const Mesh& M) {
+    const int k = static_cast<int>(M.surfaces.size());
+    if (stage == "approximated" && k + 1 != surface) begin(k + 1);
     way += stage == "extracted";
-    if (stage == "surfaceHealed") keep("refined", M, way);  // Figure 8b: S_M is extracted
-    if (stage == "projected") keep("projected", M, way);
-    if (stage == "smoothed") keep("smoothed", M, 0);
+    const std::string number = several ? std::to_string(surface) + '-' : "";
+    if (stage == "surfaceHealed") keep(number + "refined", M, surface, way);  // Figure 8b, 11a
+    if (stage == "projected") keep(number + "projected", M, surface, way);
+    if (stage == "smoothed") keep(number + "smoothed", M, surface, 0);
   }
-  void take(int ofWay, std::vector<Output>& outputs) const {
-    for (const auto& [w, output] : kept)
-      if (w == 0 || w == ofWay) outputs.push_back(output);
+  /// Surface k, for the first time or again: what was seen of it and of later ones is void.
+  void begin(int k) {
+    surface = k;
+    way = 0;
+    kept.erase(
+        std::remove_if(kept.begin(), kept.end(), [&](const Kept& o) { return o.surface >= k; }),
+        kept.end());
+  }
+  void take(const std::vector<InsertReport>& reports, std::vector<Output>& outputs) const {
+    for (const Kept& o : kept)
+      for (const InsertReport& r : reports)
+        if (o.surface == 0 ? &r == &reports[0]
+                           : o.surface == r.surface && (o.way == 0 || o.way == r.way))
+          outputs.push_back(o.output);
   }
 };
+
+/// Several files, and several surfaces in a file, become one list.
+std::vector<TriangleSurface> readSurfaces(const Arguments& a, Progress& progress) {
+  std::vector<TriangleSurface> surfaces;
+  std::vector<std::string> notes;
+  for (std::size_t i = 1; i < a.operands.size(); ++i)
+    for (const TriangleSurface& S : readSurfaces(a.operands[i], notes)) {
+      surfaces.push_back(S);
+      progress.line("surface " + a.operands[i] + ": " + S.name + ", " +
+                    std::to_string(S.points.size()) + " points, " +
+                    std::to_string(S.triangles.size()) + " triangles");
+    }
+  for (const std::string& note : notes) progress.warning(note);
+  return surfaces;
+}
 
 void runInsert(const Arguments& a, const Streams& io) {
   const std::string path = a.output();
   if (!a.has("--lc")) throw UsageError("the size is missing: --lc L");
   InsertOptions options = insertOptions(a);
-  if (a.operands.size() > 2)
-    fail("insert: " + std::to_string(a.operands.size() - 1) +
-         " surfaces are given, and this version inserts one; name one");
   const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
   for (const char* stage : {"original", "refined", "projected", "smoothed"})
     if (!prefix.empty() && path == prefix + "-" + stage + ".vtk")
@@ -1494,23 +2595,23 @@ void runInsert(const Arguments& a, const Streams& io) {
   if (!prefix.empty()) checkWritable(prefix + "-original.vtk");
   Mesh M = readMesh(a.operands[0]);
   checkInsertable(a.operands[0], M);
-  const TriangleSurface S = readSurface(a.operands[1]);
   Progress progress(io, a.has("--quiet"));
   progress.line("mesh " + a.operands[0] + ": " + sizeOf(M));
-  progress.line("surface " + a.operands[1] + ": " + std::to_string(S.points.size()) + " points, " +
-                std::to_string(S.triangles.size()) + " triangles");
-  Stages stages{prefix, 0, {}};
-  stages.keep("original", M, 0);
+  const std::vector<TriangleSurface> surfaces = readSurfaces(a, progress);
+  Stages stages{prefix, surfaces.size() > 1};
+  stages.keep("original", M, 0, 0);
   options.onStage = [&](const char* stage, const Mesh& mesh) { stages.see(stage, mesh); };
   options.onProgress = [&](const std::string& line) { progress.line(line); };
   options.optimize.onSweep = [&](const Sweep& s) { progress.sweep(s); };
-  const InsertReport report = insertSurface(M, S, options);
-  std::vector<Output> outputs{{path, vtkText(M)}};
-  stages.take(report.way, outputs);
-  printInsertion(report, S.name, io);
+  const std::vector<InsertReport> reports = insertSurfaces(M, surfaces, options);
+  std::vector<Output> outputs{{path, meshText(path, M)}};
+  stages.take(reports, outputs);
+  printInsertion(reports, M, io);
   if (!io.out.flush()) fail("standard output: the results cannot be written; nothing was written");
   writeFiles(outputs);
-  for (const std::string& w : report.warnings) progress.warning(w);
+  for (const InsertReport& report : reports)
+    for (const std::string& w : report.warnings)
+      progress.warning((reports.size() > 1 ? M.surfaces[report.surface - 1].name + ": " : "") + w);
   progress.line(path + ": " + sizeOf(M));
 }
 
@@ -1522,13 +2623,52 @@ OptimizeOptions optimizeOptions(const Arguments& a) {
   return o;
 }
 
+/// The mesh of --ideal: its nodes make the ideal elements of M, so its tetrahedra must be M's.
+std::vector<Vec3> idealNodes(const std::string& path, const Mesh& M) {
+  if (!M.xi.empty())
+    fail("--ideal " + path +
+         ": the mesh has computational elements, which are its ideal ones; --ideal is for meshes "
+         "without them (`meccano convert` it to .mesh before)");
+  const Mesh rest = readMesh(path);
+  if (rest.x.size() != M.x.size() || rest.tets.size() != M.tets.size())
+    fail(path + ": has " + sizeOf(rest) + ", the mesh " + sizeOf(M) +
+         "; --ideal needs a mesh of the same connectivity");
+  int negative = 0;
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    std::array<int, 4> a = M.tets[E], b = rest.tets[E];
+    const double volume = sixVolumes(rest.x, b);
+    negative += volume < 0;
+    if (volume == 0)
+      fail(path + ": tetrahedron " + std::to_string(E) +
+           " has no volume, so it is no ideal element");
+    std::sort(a.begin(), a.end());
+    std::sort(b.begin(), b.end());
+    if (a != b)
+      fail(path + ": tetrahedron " + std::to_string(E) +
+           " has other nodes than in the mesh; --ideal needs a mesh of the same connectivity");
+  }
+  if (negative != 0 && negative != static_cast<int>(M.tets.size()))
+    fail(path + ": " + std::to_string(negative) + " of " + std::to_string(M.tets.size()) +
+         " tetrahedra are inverted; --ideal needs a valid mesh");
+  return rest.x;
+}
+
 void runOptimize(const Arguments& a, const Streams& io) {
   const std::string path = a.output();
   OptimizeOptions options = optimizeOptions(a);
   checkWritable(path);
-  Mesh M = readMesh(a.operands[0]);
+  MeshFile file = readMeshFile(a.operands[0]);
+  Mesh& M = file.M;
+  const bool meccano = !M.xi.empty();
+  if (a.has("--ideal")) M.xi = idealNodes(a.options.at("--ideal")[0], M);
+  options.fixed = interfaceNodes(M);
+  options.fixed.insert(options.fixed.end(), file.required.begin(), file.required.end());
   Progress progress(io, a.has("--quiet"));
+  for (const std::string& w : file.warnings) progress.warning(w);
   progress.line("mesh " + a.operands[0] + ": " + sizeOf(M));
+  if (!options.fixed.empty())
+    progress.line(std::to_string(options.fixed.size()) +
+                  " required or labelled nodes inside stay where they are");
   const QualityStatistics original = qualityStatistics(M);
   options.onSweep = [&](const Sweep& s) { progress.sweep(s); };
   const OptimizeReport r = optimizeMesh(M, options);
@@ -1537,11 +2677,14 @@ void runOptimize(const Arguments& a, const Streams& io) {
                       " elements are still inverted after " + std::to_string(r.sweeps) +
                       " sweeps, nothing was written; raise --max-sweeps, or the boundary does not "
                       "allow a valid mesh");
-  writeFiles({{path, vtkText(M)}});
   const QualityStatistics smoothed = qualityStatistics(M);
+  const bool ideal = !M.xi.empty();
+  const QualityStatistics regular = qualityStatistics(M, Ideal::regular);
+  if (!meccano) M.xi.clear();
+  writeFiles({{path, meshText(path, M, file.required)}});
   progress.line(path + ": " + sizeOf(M));
   io.out << tableI({{"original", &original}, {"smoothed", &smoothed}});
-  if (!M.xi.empty()) io.out << regularLine(qualityStatistics(M, Ideal::regular));
+  if (ideal) io.out << regularLine(regular);
   io.out << r.sweeps << " sweeps, displacement " << format("%.3g", r.disp)
          << (r.converged ? ", converged\n" : ", stopped by --max-sweeps\n");
 }
@@ -1561,6 +2704,49 @@ void runStats(const Arguments& a, const Streams& io) {
   io.out << tableI({{"computational", &computational}, {"regular", &regular}});
 }
 
+void convertMesh(const std::string& in, const std::string& out, const Streams& io,
+                 std::vector<std::string>& warnings) {
+  const MeshFile file = readMeshFile(in);
+  warnings = file.warnings;
+  if (!file.M.xi.empty() && suffixOf(out) != ".vtk")
+    warnings.push_back(out +
+                       ": only .vtk keeps the meccano (the computational coordinates and the "
+                       "geometry that `insert` needs); keep " +
+                       in);
+  writeFiles({{out, meshText(out, file.M, file.required)}});
+  io.err << out << ": " << sizeOf(file.M) << std::endl;
+}
+
+void convertSurfaces(const std::string& in, const std::string& out, bool fromMesh,
+                     const Streams& io, std::vector<std::string>& warnings) {
+  const std::vector<TriangleSurface> surfaces =
+      fromMesh ? insertedSurfaces(in, readMesh(in)) : readSurfaces(in, warnings);
+  writeFiles({{out, surfaceText(out, surfaces, warnings)}});
+  for (const TriangleSurface& S : surfaces)
+    io.err << out << ": " << S.name << ", " << S.points.size() << " points, " << S.triangles.size()
+           << " triangles" << std::endl;
+}
+
+void runConvert(const Arguments& a, const Streams& io) {
+  const std::string &in = a.operands[0], &out = a.operands[1];
+  const bool toMesh = isMeshSuffix(suffixOf(out));
+  if (!toMesh && !isSurfaceSuffix(suffixOf(out)))
+    throw UsageError("'" + out + "' ends neither in " + meshSuffixes + " (meshes) nor in " +
+                     surfaceSuffixes + " (surfaces)");
+  checkWritable(out);
+  const Format from = formatOf(in, readFile(in));
+  if (toMesh && !isMesh(from) && from != Format::none)
+    fail(in + ": this is a surface (" + nameOf(from) + "), and " + out +
+         " would be a mesh; make one with `meccano box` and `meccano insert`, or write " +
+         surfaceSuffixes);
+  std::vector<std::string> warnings;
+  if (toMesh)
+    convertMesh(in, out, io, warnings);
+  else
+    convertSurfaces(in, out, isMesh(from), io, warnings);
+  for (const std::string& w : warnings) io.err << "meccano: warning: " << w << std::endl;
+}
+
 // ==== Commands: their options and help ===========================================================
 
 struct Option {
@@ -1578,7 +2764,7 @@ struct Command {
   void (*run)(const Arguments&, const Streams&);
 };
 
-constexpr Option outputOption{"-o", "OUT.vtk", "the mesh to write"};
+constexpr Option outputOption{"-o", "OUT", "the mesh to write: .vtk, .msh (Gmsh), .mesh (MEDIT)"};
 constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
 constexpr Option powerOption{
     "--power", "P", "exponent of the term that lifts the worst elements (default 48; 1: none)"};
@@ -1614,7 +2800,7 @@ const std::vector<Command>& commands() {
         quietOption},
        runTerrain},
       {"solid",
-       "SURFACE.obj",
+       "SURFACE",
        "Makes the tetrahedral mesh of the solid inside a closed surface by Algorithm 1, and prints\n"
        "its quality. Without a polycube the meccano is a box of cubes, for solids without handles.\n"
        "A polycube file has a line `cube i j k` for each cube, and `corner i j k  x y z` for each\n"
@@ -1630,27 +2816,33 @@ const std::vector<Command>& commands() {
         quietOption},
        runSolid},
       {"insert",
-       "MESH.vtk SURFACE.obj",
-       "Inserts a triangulated surface into a mesh that meccano wrote, and prints Table I: the\n"
-       "quality of the original, refined, projected and smoothed mesh, against its computational\n"
-       "elements.",
+       "MESH.vtk SURFACE [SURFACE ...]",
+       "Inserts triangulated surfaces into a mesh that meccano wrote, one after the other, and "
+       "prints\n"
+       "Table I: the quality of the original, refined, projected and smoothed mesh, against its\n"
+       "computational elements. A surface of several components becomes several.\n"
+       "Surfaces are read from OBJ, OFF, STL, PLY and GOCAD TSurf files, several of a file too.",
        2,
        1000,
        {outputOption,
         {"--lc", "L", "element size at the surface, eq. (1), in the unit of the input"},
         paperOption,
         powerOption,
-        {"--stages", "PREFIX", "also write PREFIX-{original,refined,projected,smoothed}.vtk"},
+        {"--stages", "PREFIX",
+         "also write PREFIX-{original,refined,projected,smoothed}.vtk (of several surfaces\n"
+         "                       PREFIX-1-refined.vtk, ...)"},
         maxTetsOption,
         quietOption},
        runInsert},
       {"optimize",
-       "MESH.vtk",
+       "MESH",
        "Untangles and smooths a tetrahedral mesh, Algorithm 2. The ideal elements are the\n"
-       "computational ones where the file has them; else regular, and the boundary stays in place.",
+       "computational ones where the file has them; else those of --ideal, or regular ones.\n"
+       "Without a meccano the boundary, labelled faces and MEDIT's RequiredVertices stay in place.",
        1,
        1,
        {outputOption,
+        {"--ideal", "REST", "a mesh of the same connectivity: its elements are the ideal ones"},
         {"--max-disp", "D", "stop below this displacement / shortest edge (default .01)"},
         {"--max-sweeps", "N", "stop after this many sweeps (default 300)"},
         paperOption,
@@ -1658,12 +2850,23 @@ const std::vector<Command>& commands() {
         quietOption},
        runOptimize},
       {"stats",
-       "MESH.vtk",
+       "MESH",
        "Prints the quality statistics of a tetrahedral mesh, as in Table I.",
        1,
        1,
        {},
-       runStats}};
+       runStats},
+      {"convert",
+       "IN OUT",
+       "Writes a mesh or surfaces in the format of OUT's suffix. Meshes: .vtk, .msh (Gmsh 2.2), "
+       ".mesh\n"
+       "(MEDIT); only .vtk keeps the meccano. Surfaces: .obj, .stl (binary), .off, .ply (ASCII), "
+       ".ts\n"
+       "(GOCAD TSurf); from a mesh its inserted surfaces. The content of IN tells its format.",
+       2,
+       2,
+       {},
+       runConvert}};
   return all;
 }
 

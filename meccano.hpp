@@ -508,6 +508,18 @@ MesherReport meccanoMesher(Mesh& M, const MesherOptions& options);
 ///             handle (χ ≠ 1)
 TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>& warnings);
 
+/// [§3.1 choice] The parts of S that share no point, each a surface of its own named "name.1",
+/// "name.2", ...; S itself where it is one. A warning tells of the parts.
+///   errors    InputError: an index out of range; a coordinate not finite
+std::vector<TriangleSurface> connectedComponents(const TriangleSurface& S,
+                                                 std::vector<std::string>& warnings);
+
+/// [§3.1] The first part of checkSurface() alone: exactly coincident points welded, duplicate and
+/// zero-area triangles and unused points dropped.
+///   warnings  gets one line, with the numbers
+///   errors    InputError: an index out of range; a coordinate not finite
+TriangleSurface weldSurface(const TriangleSurface& S, std::vector<std::string>& warnings);
+
 /// Neighbour across edge i (from vertex i to i + 1) of each triangle, -1 on the rim. [triangles]
 ///   number  [triangles], what messages call them; empty: their index
 ///   errors  InputError where three triangles share an edge
@@ -693,7 +705,8 @@ using Selection = std::vector<unsigned char>;
 struct Extraction {
   Selection selected;
   double energy = 0;  // what sides are ranked by: rim energy and interior coverage
-  std::string fault;  // why it is no disk; empty: it is one
+  std::string fault;  // why it is no disk, or cannot be used; empty: it is one
+  bool isBlocked = false;  // because another surface is in the way
 };
 /// [§3.4] The squares with all nodes on this side (±1) of S, one disk; then the outline's healing:
 /// cases 1 and 2 of §3.5, or [departure] rim regularization, with half squares where asked for.
@@ -904,6 +917,14 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational)
 ///           distance to an earlier surface, too many tetrahedra; MethodError: a step cannot reach
 ///           what it promises; SolverError: a linear solve failed. M is unchanged when it throws.
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options);
+
+/// [§3, §4.2] Inserts several surfaces, in this order: all or none. A surface of several components
+/// becomes several. Nodes of earlier surfaces slide on theirs while later ones are inserted.
+///   returns a report for each surface; original and smoothed are of the mesh before and after it
+///   errors  as insertSurface, the message begins with the surface's name; InputError: two surfaces
+///           cross or touch, or one and a surface of M. M is unchanged when it throws.
+std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
+                                         const InsertOptions& options);
 
 }  // namespace meccano
 #endif

@@ -19,14 +19,14 @@ using meccano::Vec3;
 namespace samples = meccano::samples;
 
 constexpr const char* help =
-    "usage: generate DIR                                    writes DIR/cube_sine, DIR/layers\n"
+    "usage: generate DIR                                    writes DIR/cube_sine, /faults, /layers\n"
     "       generate --surface NAME [ARGS] FILE.obj         writes one surface\n"
     "       generate --island N FILE.asc                    a synthetic island of N x N heights\n"
     "       generate --layer DEM.asc HEIGHT MARGIN SMOOTH FILE.obj\n"
     "           the terrain, its heights averaged SMOOTH times over 3 x 3, lifted by HEIGHT, up\n"
     "           to MARGIN before its sides\n"
     "\n"
-    "NAME [ARGS] (default)    all in the unit cube, formulas in surfaces.hpp\n"
+    "NAME [ARGS] (default)    all but fault in the unit cube, formulas in surfaces.hpp\n"
     "  sine A (.1) N (64)     z = .5 + A sin(2 pi x), N x N x 2 triangles\n"
     "  sine2 A (.1)           z = .5 + A sin(2 pi x) sin(2 pi y)\n"
     "  plane AX (10) AY (0)   a square turned about x, then y; degrees\n"
@@ -38,7 +38,8 @@ constexpr const char* help =
     "  threeLobed\n"
     "  raggedRim\n"
     "  ridge KIND (0)         0 mild, 1 knife\n"
-    "  patch SEED (1)         a random patch of make stress\n";
+    "  patch SEED (1)         a random patch of make stress\n"
+    "  fault K (1)            west, east, ring, lobe of the sample, in a box of 4 x 3 x 2\n";
 
 /// The shortest text that reads back as the same double.
 std::string shortest(double value) {
@@ -80,6 +81,27 @@ void writeSineSample(const std::string& file) {
       if (i > 0 && j > 0) out << "f -67 -2 -1\nf -67 -1 -66\n";
     }
   checkWritten(out, file);
+}
+
+/// A GOCAD TSurf; coordinates to 1e-5.
+void writeTs(const TriangleSurface& S, const std::string& file) {
+  std::ofstream out(file);
+  out << "GOCAD TSurf 1\nHEADER {\nname:" << S.name << "\n}\nTFACE\n";
+  auto rounded = [](double value) { return shortest(std::round(value * 1e5) / 1e5); };
+  for (std::size_t i = 0; i < S.points.size(); ++i) {
+    const Vec3& p = S.points[i];
+    out << "VRTX " << i + 1 << " " << rounded(p.x) << " " << rounded(p.y) << " " << rounded(p.z)
+        << "\n";
+  }
+  for (const auto& t : S.triangles)
+    out << "TRGL " << t[0] + 1 << " " << t[1] + 1 << " " << t[2] + 1 << "\n";
+  out << "END\n";
+  checkWritten(out, file);
+}
+
+void writeFaults(const std::string& folder) {
+  std::filesystem::create_directories(folder);
+  for (const TriangleSurface& S : samples::faults()) writeTs(S, folder + "/" + S.name + ".ts");
 }
 
 void writeAsc(const meccano::Terrain& T, const std::string& file) {
@@ -141,6 +163,7 @@ TriangleSurface surfaceByName(const std::string& name, const std::vector<std::st
   if (name == "ridge")
     return samples::ridge(arg(0, 0) > 0 ? samples::Ridge::knife : samples::Ridge::mild);
   if (name == "patch") return samples::randomPatch(static_cast<std::uint64_t>(arg(0, 1)));
+  if (name == "fault") return samples::faults().at(static_cast<std::size_t>(arg(0, 1) - 1));
   throw meccano::InputError("generate: no surface '" + name + "'; see --help");
 }
 
@@ -164,6 +187,7 @@ int main(int argc, char** argv) {
     } else if (args.size() == 1 && args[0][0] != '-') {
       std::filesystem::create_directories(args[0] + "/cube_sine");
       writeSineSample(args[0] + "/cube_sine/sine.obj");
+      writeFaults(args[0] + "/faults");
       std::filesystem::create_directories(args[0] + "/layers");
       writeLayersSample(args[0] + "/layers");
     } else {

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: MIT
 //
-// Analytic test surfaces, used by the samples, the tests and `make stress`. All lie in the unit
-// cube, at least .13 from its sides; edges are .01 to .02 long; triangles are counter-clockwise in
-// the plane of the formula's parameters. c = (.5, .5, .5) is the cube's centre.
+// Analytic test surfaces, used by the samples, the tests and `make stress`. All but the faults, at
+// the end, lie in the unit cube, at least .13 from its sides; edges are .01 to .02 long; triangles
+// are counter-clockwise in the plane of the formula's parameters. c = (.5, .5, .5) is the cube's
+// centre.
 #ifndef MECCANO_SAMPLES_SURFACES_HPP
 #define MECCANO_SAMPLES_SURFACES_HPP
 
@@ -308,6 +309,44 @@ inline TriangleSurface randomPatch(std::uint64_t seed) {
   patch::fitIntoCube(S, random);
   constexpr const char* outlines[3] = {"square", "disc", "lobed"};
   return named(S, outlines[seed % 3]);
+}
+
+// ==== Faults ====================================================================================
+
+/// A plane through `at` for a fault (angles in degrees): `strike` turns it about z, x towards y;
+/// then `dip` is its angle with the horizontal plane. s runs along strike, t up the dip.
+struct FaultPlane {
+  Vec3 at;
+  double strike, dip;
+  Vec3 point(double s, double t, double off) const {
+    return at + turned(turned({s, t, off}, 0, dip), 2, strike);
+  }
+};
+
+/// Four faults in the box [0, 4] x [0, 3] x [0, 2], edges near .08 (`samples/faults`). `west` and
+/// `east`: quads of 1.9 x 1.1, dipping towards each other, steeper upwards (listric) and waved
+/// along strike; `ring`: a bent disc; `lobe`: an outline of three lobes. At least .27 apart and .3
+/// from the box.
+inline std::vector<TriangleSurface> faults() {
+  auto quad = [](FaultPlane P, double length, double width, double listric, double wave) {
+    return sheet(24, 14, [=](double s, double t) {
+      return P.point(.5 * length * s, .5 * width * t,
+                     listric * (t * t - 1. / 3) + wave * std::sin(.75 * pi * s));
+    });
+  };
+  const TriangleSurface west = quad({{.9, 1.5, 1}, 84, 62}, 1.9, 1.1, .07, .06);
+  const TriangleSurface east = quad({{2.08, 1.55, 1}, 276, 58}, 1.9, 1.1, .05, -.07);
+  const FaultPlane ringPlane{{3.14, .84, 1.05}, 40, 50};
+  const TriangleSurface ring = polarSheet(6, [=](double r, double theta) {
+    return ringPlane.point(.48 * r * std::cos(theta), .48 * r * std::sin(theta), .08 * r * r);
+  });
+  const FaultPlane lobePlane{{3.05, 2.1, .95}, 100, 65};
+  const TriangleSurface lobe = polarSheet(7, [=](double r, double theta) {
+    const double R = .5 * r * (1 + .18 * r * r * std::cos(3 * theta));
+    const double s = R * std::cos(theta), t = R * std::sin(theta);
+    return lobePlane.point(s, t, .25 * (s * s - t * t));
+  });
+  return {named(west, "west"), named(east, "east"), named(ring, "ring"), named(lobe, "lobe")};
 }
 
 // ==== Terrain and layers ========================================================================

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
 //
-// main.cpp: the OBJ reader, the .vtk file, atomic output, and the command line.
+// main.cpp: the readers and writers of all formats, atomic output, and the command line.
 #include <doctest/doctest.h>
 
 #include <fstream>
@@ -118,6 +118,18 @@ std::string sineObj(int n) {
       t << "f " << a << " " << b << " " << d << "\nf " << a << " " << d << " " << c << "\n";
     }
   return t.take();
+}
+
+/// A box whose middle plane x = 0 is labelled as surface 1.
+Mesh halvedBox() {
+  Mesh M = boxMesh({-1, 0, 0}, {2, 1, 3}, {2, 2, 2});
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      bool on = true;
+      for (int j = 0; j < 4; ++j) on &= j == i || M.x[M.tets[E][j]].x == 0;
+      if (on) M.faceLabel[E][i] = 1;
+    }
+  return M;
 }
 
 }  // namespace
@@ -391,6 +403,508 @@ TEST_SUITE("files") {
   }
 }
 
+TEST_SUITE("formats") {
+  TEST_CASE("broken files: each is refused with its place and its reason, and each is expected") {
+    struct Rule {
+      std::string place, what;
+    };
+    const std::map<std::string, Rule> rules{
+        {"mesh_count.mesh",
+         {":10: ", "the entries of a section (1000000) are more than the rest of the file holds"}},
+        {"mesh_dimension.mesh", {":3: ", "the dimension is not 3"}},
+        {"mesh_hexahedra.mesh", {":9: ", "Hexahedra are in it; only tetrahedra of four nodes"}},
+        {"mesh_index.mesh", {":11: ", "node 5 does not exist, there are 4 vertices"}},
+        {"mesh_no_tetrahedron.mesh", {": ", "no tetrahedron in it"}},
+        {"mesh_node_twice.mesh", {":11: ", "tetrahedron 0 names a node twice"}},
+        {"mesh_not_finite.mesh", {":6: ", "a coordinate is not finite"}},
+        {"mesh_required.mesh", {":14: ", "node 0 does not exist"}},
+        {"mesh_truncated.mesh", {": ", "the file has no End"}},
+        {"mesh_unknown.mesh", {": ", "its content is of no known format; meshes are read from"}},
+        {"msh_binary.msh",
+         {":2: ", "this Gmsh file is binary version 2.2; save it as ASCII version 2.2"}},
+        {"msh_count.msh", {":5: ", "the number of nodes is negative"}},
+        {"msh_hexahedron.msh", {":13: ", "an element of type 5; only tetrahedra of four nodes"}},
+        {"msh_index.msh", {":13: ", "node 5 does not exist"}},
+        {"msh_name.msh", {":6: ", "a physical name is written in \"quotes\""}},
+        {"msh_no_tetrahedron.msh", {": ", "no tetrahedron in it"}},
+        {"msh_node_in_tetrahedron_twice.msh", {":13: ", "tetrahedron 0 names a node twice"}},
+        {"msh_node_twice.msh", {":7: ", "node 1 is there twice"}},
+        {"msh_not_finite.msh", {":7: ", "a coordinate is not finite"}},
+        {"msh_section.msh", {":10: ", "'EndNodes' is where $EndNodes should be"}},
+        {"msh_truncated.msh", {":13: ", "the file ends where a node should be"}},
+        {"msh_version.msh",
+         {":2: ", "this Gmsh file is ASCII version 4.1; save it as ASCII version 2.2"}},
+        {"msh_word.msh", {":4: ", "'Nodes' is where a section ($...) should be"}},
+        {"obj_corner.obj", {":4: ", "'3/x' is no face corner"}},
+        {"obj_empty.obj", {": ", "the file is empty"}},
+        {"obj_flat.obj",
+         {": ", "surface 'obj_flat' is empty: none of its 1 triangles has an area"}},
+        {"obj_index.obj", {":5: ", "the face names vertex 4, above are 3"}},
+        {"obj_no_face.obj", {": ", "no triangle in it (3 vertices, no f line)"}},
+        {"obj_not_finite.obj", {":1: ", "a coordinate is not finite"}},
+        {"obj_two_coordinates.obj", {":1: ", "a vertex needs three coordinates, here are 2"}},
+        {"obj_two_corners.obj", {":4: ", "a face needs three corners, here are 2"}},
+        {"obj_word.obj", {":2: ", "'x' is no number"}},
+        {"off_binary.off", {":1: ", "this OFF file is binary"}},
+        {"off_corner_missing.off", {":6: ", "a corner of the face is missing"}},
+        {"off_counts.off", {":2: ", "'many' is no number; correct the number of faces"}},
+        {"off_index.off", {":6: ", "the face names vertex 3, the file has 3"}},
+        {"off_no_counts.off",
+         {": ", "the file ends where the numbers of vertices and faces should be"}},
+        {"off_no_face.off", {":2: ", "no triangle in it (3 vertices, 0 faces)"}},
+        {"off_one_count.off", {":2: ", "the number of faces is missing"}},
+        {"off_truncated.off", {": ", "the file ends where a face should be"}},
+        {"off_two_coordinates.off", {":3: ", "a vertex needs three coordinates, here are 2"}},
+        {"off_two_corners.off", {":6: ", "a face needs three corners, here are 2"}},
+        {"ply_big_endian.ply",
+         {":2: ", "this PLY file is big-endian; save it as ASCII or binary little-endian"}},
+        {"ply_binary_index.ply", {": byte 214: ", "-1 is the vertex of a face"}},
+        {"ply_binary_truncated.ply",
+         {": byte 214: ", "the file ends where the vertex of a face should be"}},
+        {"ply_count.ply",
+         {":9: ", "the vertex elements (2000000000) are more than the rest of the file holds"}},
+        {"ply_format.ply", {":2: ", "'packed' is no format of a PLY file"}},
+        {"ply_head.ply", {":3: ", "'property' cannot be read in the head of a PLY file"}},
+        {"ply_index.ply",
+         {":13: ", "3 is the vertex of a face, it must be an integer from 0 to 2"}},
+        {"ply_negative.ply", {":3: ", "the number of elements is negative"}},
+        {"ply_no_end.ply", {": ", "the head has no end_header"}},
+        {"ply_no_face.ply", {": ", "no triangle in it (3 vertices, no face element)"}},
+        {"ply_no_format.ply", {": ", "the head has no format"}},
+        {"ply_no_x.ply", {": ", "its vertices have no property x; x, y and z are needed"}},
+        {"ply_not_finite.ply", {":11: ", "a coordinate is not finite"}},
+        {"ply_truncated.ply", {":14: ", "the file ends where the vertex of a face should be"}},
+        {"ply_two_corners.ply", {":13: ", "a face needs three corners, here are 2"}},
+        {"ply_type.ply", {":4: ", "'real' is no type of a PLY property"}},
+        {"ply_word.ply", {":11: ", "'b' is no number where a value should be"}},
+        {"stl_binary_empty.stl", {": byte 80: ", "no triangle in it"}},
+        {"stl_binary_head.stl", {": byte 61: ", "the file ends in its head of 84 bytes"}},
+        {"stl_binary_not_finite.stl", {": byte 158: ", "a coordinate is not finite"}},
+        {"stl_binary_solid.stl", {": byte 80: ", "the head promises 2 triangles"}},
+        {"stl_binary_truncated.stl",
+         {": byte 80: ",
+          "the head promises 2 triangles, which are 184 bytes, and the file has 134"}},
+        {"stl_coordinate.stl", {":5: ", "a vertex needs three coordinates, here are 2"}},
+        {"stl_flat.stl",
+         {": ", "surface 'stl_flat' is empty: none of its 0 triangles has an area"}},
+        {"stl_keyword.stl", {":3: ", "'inner' is no keyword of an ASCII STL file"}},
+        {"stl_outside.stl", {":10: ", "'facet' is outside a solid"}},
+        {"stl_solid_in_solid.stl", {":9: ", "a solid begins before the last one ended"}},
+        {"stl_truncated.stl", {": ", "the file ends without endsolid"}},
+        {"stl_two_corners.stl", {":7: ", "a face needs three corners, here are 2"}},
+        {"ts_atom.ts", {":9: ", "vertex 7 is named"}},
+        {"ts_coordinates.ts", {":6: ", "a vertex needs three coordinates, here are 2"}},
+        {"ts_end_missing.ts", {":10: ", "an object begins before the last one had its END"}},
+        {"ts_id.ts", {":6: ", "'one' is no number; correct the number of a vertex"}},
+        {"ts_index.ts", {":9: ", "vertex 4 is named, and no VRTX or ATOM line above defines it"}},
+        {"ts_no_surface.ts", {": ", "no TSurf object in it"}},
+        {"ts_no_triangle.ts", {":9: ", "surface 'bad one' has no TRGL line"}},
+        {"ts_truncated.ts", {": ", "the last object has no END"}},
+        {"ts_twice.ts", {":9: ", "vertex 3 is there twice"}},
+        {"ts_two_corners.ts", {":9: ", "a face needs three corners, here are 2"}},
+        {"unknown.txt", {": ", "its content is of no known format"}},
+        {"vtk_binary.vtk", {":3: ", "this VTK file is binary; save it as ASCII"}},
+        {"vtk_index.vtk", {":11: ", "node 4 does not exist, there are 4 points"}}};
+    const fs::path folder = fs::path(__FILE__).parent_path() / "data" / "bad";
+    for (const fs::directory_entry& file : fs::directory_iterator(folder))
+      CHECK_MESSAGE(rules.count(file.path().filename().string()) == 1, file.path().string());
+    for (const auto& entry : rules) {
+      const std::string& name = entry.first;
+      const Rule& rule = entry.second;
+      CAPTURE(name);
+      const std::string path = (folder / name).string(), suffix = suffixOf(path);
+      std::vector<std::string> warnings;
+      const std::string message = messageOf([&] {
+        if (isMeshSuffix(suffix))
+          readMeshFile(path);
+        else
+          readSurfaces(path, warnings);
+      });
+      CHECK_MESSAGE(message.compare(0, path.size() + rule.place.size(), path + rule.place) == 0,
+                    message);
+      CHECK_MESSAGE(message.compare(std::min(message.size(), path.size() + rule.place.size()),
+                                    rule.what.size(), rule.what) == 0,
+                    message);
+    }
+  }
+
+  TEST_CASE("a surface comes back from every format: the same doubles, STL the same floats") {
+    Folder folder;
+    TriangleSurface S = parseObj("s.obj", sineObj(4));
+    for (Vec3& x : S.points) x = {1e3 + x.x / 3, x.y / 7, -1e-9 * x.z};
+    S.name = "a fault";
+    for (const char* suffix : {".obj", ".off", ".ply", ".ts", ".stl"}) {
+      CAPTURE(suffix);
+      std::vector<std::string> warnings;
+      const std::string path = folder / (std::string("stem") + suffix);
+      writeFiles({{path, surfaceText(path, {S}, warnings)}});
+      const bool stl = std::string(suffix) == ".stl";
+      CHECK(warnings.size() == (stl ? 1 : 0));
+      warnings.clear();
+      const std::vector<TriangleSurface> R = readSurfaces(path, warnings);
+      REQUIRE(R.size() == 1);
+      CHECK(warnings.empty());
+      const bool named = std::string(suffix) == ".obj" || std::string(suffix) == ".ts";
+      CHECK(R[0].name == (named ? "a fault" : "stem"));
+      REQUIRE(R[0].triangles.size() == S.triangles.size());
+      if (!stl) {
+        CHECK(R[0].points == S.points);
+        CHECK(R[0].triangles == S.triangles);
+      }
+      int different = 0;
+      for (std::size_t t = 0; t < S.triangles.size(); ++t)
+        for (int i = 0; i < 3; ++i) {
+          const Vec3 x = S.points[S.triangles[t][i]], y = R[0].points[R[0].triangles[t][i]];
+          const Vec3 rounded{double(float(x.x)), double(float(x.y)), double(float(x.z))};
+          different += !(y == (stl ? rounded : x));
+        }
+      CHECK(different == 0);
+    }
+  }
+
+  TEST_CASE("several surfaces: .ts keeps them apart and named, one-object formats join them") {
+    TriangleSurface A = parseObj("a.obj", sineObj(2)), B = A;
+    for (Vec3& x : B.points) x.z += 1;
+    A.name = "north", B.name = "south wing";
+    std::vector<std::string> warnings;
+    const std::string ts = surfaceText("x.ts", {A, B}, warnings);
+    CHECK(warnings.empty());
+    const std::vector<TriangleSurface> R = parseSurfaces("x.ts", ts, warnings);
+    REQUIRE(R.size() == 2);
+    CHECK(R[0].name == "north");
+    CHECK(R[1].name == "south wing");
+    CHECK(R[1].points == B.points);
+    const std::string off = surfaceText("x.off", {A, B}, warnings);
+    REQUIRE(warnings.size() == 1);
+    CHECK(has(warnings[0], "its 2 surfaces are written as one"));
+    CHECK(parseOff("x.off", off).triangles.size() == 2 * A.triangles.size());
+    const TriangleSurface O = parseObj("x.obj", surfaceText("x.obj", {A, B}, warnings));
+    CHECK(O.name == "x");  // two names are no label
+    CHECK(O.triangles.back()[0] >= static_cast<int>(A.points.size()));
+  }
+
+  TEST_CASE("the content decides the format, whatever the suffix says") {
+    const std::string obj =
+        "\xEF\xBB\xBF\r\n\n# c\r\no one name\r\nv 0 0 0\r\nv 1 0 0\r\nv 0 1 0\r\n"
+        "f 1 2 3\r\n";
+    const std::string off = "\n# c\nOFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
+    std::vector<std::string> warnings;
+    for (const char* name : {"a.stl", "a.ply", "a.off", "a.ts", "a"}) {
+      const std::vector<TriangleSurface> S = parseSurfaces(name, obj, warnings);
+      CHECK(S[0].triangles.size() == 1);
+      CHECK(S[0].name == "one name");
+      CHECK(parseSurfaces(name, off, warnings)[0].name == "a");
+    }
+    CHECK(formatOf("a.obj", "$MeshFormat\n") == Format::msh);
+    CHECK(formatOf("a.obj", "# c\nMeshVersionFormatted 1\n") == Format::medit);
+    CHECK(formatOf("a.obj", "what") == Format::obj);
+    CHECK(formatOf("a.x", "what") == Format::none);
+  }
+
+  TEST_CASE("OBJ: a line goes on behind a backslash") {
+    CHECK(parseObj("s.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 \\\n 4 3\n")
+              .triangles.size() == 2);
+  }
+
+  TEST_CASE("OFF: colours, comments, counts in the first line, polygons as fans") {
+    const TriangleSurface S = parseOff("q.off",
+                                       "COFF 4 2 5 # counts\n0 0 0 255 0 0 255\n1 0 0 1 1 1 1\n\n"
+                                       "1 1 0 0 0 0 0 # last but one\n0 1 0 1 1 1 1\n"
+                                       "4 0 1 2 3 0.5 0.5 0.5\n3 2 1 0\n");
+    CHECK(S.points.size() == 4);
+    REQUIRE(S.triangles.size() == 3);
+    CHECK(S.triangles[1] == std::array<int, 3>{0, 2, 3});
+  }
+
+  TEST_CASE(
+      "STL: ASCII names with blanks, several solids; corners that coincide become one point") {
+    const std::string facet =
+        "  FACET NORMAL 0 0 1\n OUTER LOOP\n VERTEX 0 0 0\n VERTEX 1 0 0\n"
+        " VERTEX 0 1 0\n ENDLOOP\n ENDFACET\n";
+    const std::string other = with(facet, "VERTEX 0 0 0", "VERTEX 1 1 -0");
+    std::vector<std::string> warnings;
+    const std::string one = "solid  exported by some program\n" + facet + other + "endsolid\n";
+    const std::vector<TriangleSurface> S = parseSurfaces("a.stl", one, warnings);
+    REQUIRE(S.size() == 1);
+    CHECK(S[0].name == "a");
+    CHECK(S[0].points.size() == 4);
+    CHECK(warnings.empty());
+    const std::string two =
+        with(one, "ENDFACET\n  FACET", "ENDFACET\nendsolid x\nsolid the other\nFACET");
+    const std::vector<TriangleSurface> T = parseSurfaces("a.stl", two, warnings);
+    REQUIRE(T.size() == 2);
+    CHECK(T[0].name == "exported by some program");
+    CHECK(T[1].name == "the other");
+  }
+
+  TEST_CASE("STL: a binary file may begin with solid") {
+    std::string text = stlText(parseObj("s.obj", sineObj(3)));
+    text.replace(0, 12, "solid name x");
+    std::vector<std::string> warnings;
+    const std::vector<TriangleSurface> S = parseSurfaces("b.stl", text, warnings);
+    CHECK(S[0].triangles.size() == 18);
+    CHECK(S[0].points.size() == 16);
+    CHECK(formatOf("b.stl", text + "x") == Format::stlBinary);  // refused for its size, not as text
+    for (std::size_t length = 0; length < text.size(); ++length)
+      CHECK(messageOf([&] { parseSurfaces("b.stl", text.substr(0, length), warnings); }) != "");
+  }
+
+  TEST_CASE("PLY: other properties, lists and elements are passed over, in both codings") {
+    const std::string head =
+        "comment x\nelement vertex 4\nproperty uchar red\nproperty double z\nproperty float x\n"
+        "property list uint8 int16 tags\nproperty float y\nelement camera 1\nproperty int i\n"
+        "property list ushort float64 view\nelement face 1\nproperty list char float uv\n"
+        "property list uchar uint vertex_index\nproperty short s\nelement edge 1\n"
+        "property int a\nend_header\n";
+    const TriangleSurface A =
+        parsePly("a.ply", "ply\r\nformat ascii 1.0\r\n" + head +
+                              "255 .25 0 2 -7 7 0\n1 .5 1 0 0\n2 .75 1 1 300 1\n3 -1 0 0 1\n"
+                              "9 2 1.5 2.5\n1 .5 4 0 1 2 3 -5\n0\n");
+    std::string bytes = "ply\nformat binary_little_endian 1.0\n" + head;
+    auto put = [&](auto value) {
+      bytes.append(reinterpret_cast<const char*>(&value), sizeof value);
+    };
+    auto vertex = [&](int red, double z, float x, std::vector<int> tags, float y) {
+      put(static_cast<std::uint8_t>(red)), put(z), put(x);
+      put(static_cast<std::uint8_t>(tags.size()));
+      for (int t : tags) put(static_cast<std::int16_t>(t));
+      put(y);
+    };
+    vertex(255, .25, 0, {-7, 7}, 0), vertex(1, .5, 1, {}, 0), vertex(2, .75, 1, {300}, 1);
+    vertex(3, -1, 0, {}, 1);
+    put(std::int32_t(9)), put(std::uint16_t(2)), put(1.5), put(2.5);
+    put(std::int8_t(1)), put(.5f), put(std::uint8_t(4));
+    for (unsigned n : {0u, 1u, 2u, 3u}) put(n);
+    put(std::int16_t(-5)), put(std::int32_t(0));
+    const TriangleSurface B = parsePly("a.ply", bytes);
+    for (const TriangleSurface* S : {&A, &B}) {
+      CHECK(S->points == std::vector<Vec3>{{0, 0, .25}, {1, 0, .5}, {1, 1, .75}, {0, 1, -1}});
+      CHECK(S->triangles == std::vector<std::array<int, 3>>{{0, 1, 2}, {0, 2, 3}});
+    }
+  }
+
+  TEST_CASE("GOCAD: ids in any order, atoms, depth, several objects with their names") {
+    const std::string text =
+        "# comment\nGOCAD TSurf 1 \nHEADER {\n*visible:true\nname:North fault \n}\n"
+        "PROPERTY_CLASS_HEADER X {\nname:no name\n}\nTFACE\nVRTX 30 0 0 5 CNXYZ\n"
+        "PVRTX 7 1 0 6 .5 .5\nVRTX 9 0 1 7\nTRGL 7 9 30\nTFACE\nATOM 31 9\nPATOM 32 7 .5\n"
+        "VRTX 33 1 1 8\nTRGL 31 32 33\nBSTONE 7\nBORDER 1 2 3\nEND\n"
+        "GOCAD VSet 1\nVRTX 1 0 0 0\nEND\n"
+        "GOCAD TSurf 1\nHEADER {\n}\nZPOSITIVE Depth\nVRTX 1 0 0 100\nVRTX 2 1 0 100\n"
+        "VRTX 3 0 1 200\nTRGL 1 2 3\nEND\n";
+    std::vector<std::string> warnings;
+    const std::vector<TriangleSurface> S = parseSurfaces("f.ts", text, warnings);
+    REQUIRE(S.size() == 2);
+    CHECK(S[0].name == "North fault");
+    CHECK(S[0].points == std::vector<Vec3>{{0, 0, 5}, {1, 0, 6}, {0, 1, 7}, {1, 1, 8}});
+    CHECK(S[0].triangles == std::vector<std::array<int, 3>>{{1, 2, 0}, {2, 1, 3}});
+    CHECK(S[1].name == "f");
+    CHECK(S[1].points[2] == Vec3{0, 1, -200});
+    REQUIRE(warnings.size() == 1);
+    CHECK(has(warnings[0], "f.ts: surface 'f': ZPOSITIVE Depth, z is negated"));
+  }
+
+  TEST_CASE("double triangles and such without area are dropped, and counted in a warning") {
+    std::vector<std::string> warnings;
+    const std::vector<TriangleSurface> S =
+        parseSurfaces("s.obj",
+                      "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 0\nv 2 0 0\nv 9 9 9\nf 1 2 3\nf 3 4 2\nf 1 "
+                      "2 5\nf 1 4 3\n",
+                      warnings);
+    CHECK(S[0].triangles.size() == 1);
+    CHECK(S[0].points.size() == 3);
+    REQUIRE(warnings.size() == 1);
+    CHECK_MESSAGE(has(warnings[0], "1 duplicate triangle, 2 zero-area triangles"), warnings[0]);
+  }
+
+  TEST_CASE("Gmsh and MEDIT: a labelled mesh comes back, node by node and face by face") {
+    const Mesh M = halvedBox();
+    const Cells C = cellsOf(M);
+    for (const char* suffix : {".msh", ".mesh"}) {
+      CAPTURE(suffix);
+      const std::string path = std::string("m") + suffix, text = meshText(path, M);
+      const MeshFile R = parseMesh(path, text);
+      CHECK(R.warnings.empty());
+      CHECK(R.M.x == M.x);
+      CHECK(R.M.tets == C.tets);
+      CHECK(R.M.xi.empty());
+      REQUIRE(R.M.surfaces.size() == 1);
+      REQUIRE(R.M.patches.size() == 6);
+      const bool named = std::string(suffix) == ".msh";  // MEDIT has no names
+      CHECK(R.M.patches[1].name == (named ? "x+" : "patch 2"));
+      std::map<std::array<int, 3>, int> faces[2];
+      for (const Mesh* mesh : {&M, &R.M})
+        for (int k = -6; k <= 1; ++k)
+          for (std::array<int, 3> f : surfaceFaces(*mesh, k)) {
+            std::sort(f.begin(), f.end());
+            if (k != 0) faces[mesh == &M][f] = k;
+          }
+      CHECK(faces[1].size() > 10);
+      CHECK(faces[0] == faces[1]);
+      // without a meccano all three formats hold the same, and give it back
+      for (const char* other : {"o.vtk", "o.msh", "o.mesh"}) {
+        const Mesh again = parseMesh(other, meshText(other, R.M)).M;
+        CHECK(again.x == R.M.x);
+        CHECK(again.tets == R.M.tets);
+        CHECK(again.faceLabel == R.M.faceLabel);
+        CHECK(meshText(other, again) ==
+              meshText(other, parseMesh(other, meshText(other, again)).M));
+      }
+    }
+  }
+
+  TEST_CASE("Gmsh and MEDIT: a file cut anywhere is refused") {
+    for (const char* path : {"m.msh", "m.mesh"}) {
+      const std::string text = meshText(path, boxMesh({0, 0, 0}, {1, 1, 1}, {1, 1, 1}));
+      int accepted = 0;
+      for (std::size_t length = 0; length + 1 < text.size(); ++length)
+        accepted += messageOf([&] { parseMesh(path, text.substr(0, length)); }) == "";
+      CHECK(accepted == 0);
+    }
+  }
+
+  TEST_CASE("Gmsh: physical groups with names, unique ones; nodes of any numbers, other elements") {
+    Mesh M = halvedBox();
+    M.surfaces.resize(1);
+    M.surfaces[0].name = "x+";  // as a patch is called
+    const std::string text = mshText(M);
+    CHECK(has(text, "$PhysicalNames\n8\n2 1 \"x+\"\n2 2 \"x-\"\n2 3 \"x+ (3)\"\n"));
+    CHECK(has(text, "3 1 \"volume\"\n$EndPhysicalNames\n"));
+    const MeshFile R = parseMsh(
+        "g.msh",
+        "$MeshFormat\r\n2.2 0 8\r\n$EndMeshFormat\r\n$PhysicalNames\r\n1\r\n2 40 \"top \"\r\n"
+        "$EndPhysicalNames\r\n$Comments\nNodes and $Elements\n$EndComments\n$Nodes\n4\n"
+        "5 0 0 0\n300 1 0 0\n7 0 1 0\n1000000 0 0 1\n$EndNodes\n$Elements\n6\n1 15 2 0 1 5\n"
+        "2 1 2 0 1 5 7\n3 2 2 40 3 5 7 300\n4 2 2 0 8 5 300 1000000\n9 4 3 2 2 0 5 300 7 1000000\n"
+        "10 2 2 40 3 300 5 7\n$EndElements\n");
+    CHECK(R.M.x.size() == 4);
+    CHECK(R.M.tets[0] == std::array<int, 4>{0, 1, 2, 3});
+    REQUIRE(R.M.patches.size() == 2);
+    CHECK(R.M.patches[0].name == "patch 1");  // no physical group: the geometric entity, 8
+    CHECK(R.M.patches[1].name == "top ");
+    CHECK(R.M.faceLabel[0] == std::array<int, 4>{0, 0, -1, -2});
+    REQUIRE(R.warnings.size() == 1);
+    CHECK(has(R.warnings[0], "1 triangles are no faces"));
+  }
+
+  TEST_CASE("MEDIT: comments, sections of other kinds, required vertices; regions become one") {
+    const MeshFile R = parseMedit(
+        "g.mesh",
+        "# first\nMeshVersionFormatted 1\nDimension\n3 # space\nVertices 5\n0 0 0 0\n1 0 0 0\n"
+        "0 1 0 0\n0 0 1 0\n1 1 1 0\nEdges\n1\n1 2 7\nRidges 1 1\nTetrahedra\n2\n1 2 3 4 1\n"
+        "2 3 4 5 2\nRequiredVertices\n2\n3\n1\nNormals\n1\n0 0 -1e0\nTriangles\n1\n4 3 2 9\nEnd\n");
+    CHECK(R.M.tets.size() == 2);
+    CHECK(R.required == std::vector<int>{2, 0});
+    REQUIRE(R.M.surfaces.size() == 1);
+    CHECK(interfaceNodes(R.M) == std::vector<int>{1, 2, 3});
+    REQUIRE(R.warnings.size() == 1);
+    CHECK(has(R.warnings[0], "2 regions"));
+    CHECK(parseMedit("h.mesh", meditText(R.M, R.required)).required == R.required);
+  }
+
+  TEST_CASE("convert: meshes and surfaces of all formats; what is lost is said") {
+    Folder folder;
+    const std::string box = folder / "m.vtk";
+    REQUIRE(call({"box", "-o", box, "--cells", "1", "1", "2"}).status == 0);
+    for (const char* name : {"a.msh", "a.mesh"}) {
+      const Outcome o = call({"convert", box, folder / name});
+      CHECK(o.status == 0);
+      CHECK(has(o.err, "only .vtk keeps the meccano"));
+      CHECK(readMesh(folder / name).tets.size() == 12);
+      CHECK(has(call({"stats", folder / name}).out, "12 nodes, 12 tetrahedra"));
+      const std::string S = folder.file("s.obj", sineObj(4));
+      const Outcome refused =
+          call({"insert", folder / name, S, "-o", folder / "x.vtk", "--lc", ".1"});
+      CHECK(refused.status == 1);
+      CHECK(has(refused.err, "only .vtk keeps the meccano"));
+    }
+    CHECK(call({"convert", box, folder / "b.vtk"}).err ==
+          folder / "b.vtk" + ": 12 nodes, 12 tetrahedra\n");
+    CHECK(readFile(folder / "b.vtk") == readFile(box));
+    CHECK(call({"box", "-o", folder / "direct.msh", "--cells", "1", "1", "2"}).status == 0);
+    CHECK(readFile(folder / "direct.msh") == readFile(folder / "a.msh"));
+    const Outcome none = call({"convert", box, folder / "s.ts"});
+    CHECK(none.status == 1);
+    CHECK(has(none.err, "no surface is inserted"));
+    CHECK(!fs::exists(folder / "s.ts"));
+    const std::string half = folder.file("half.vtk", vtkText(halvedBox()));
+    const Outcome sheet = call({"convert", half, folder / "s.ts"});
+    REQUIRE_MESSAGE(sheet.status == 0, sheet.err);
+    std::vector<std::string> warnings;
+    const std::vector<TriangleSurface> S = readSurfaces(folder / "s.ts", warnings);
+    REQUIRE(S.size() == 1);
+    CHECK(S[0].name == "surface 1");
+    for (Vec3 x : S[0].points) CHECK(x.x == 0);
+    CHECK(call({"convert", folder / "s.ts", folder / "s.ply"}).status == 0);
+    const Outcome mesh = call({"convert", folder / "s.ts", folder / "s.mesh"});
+    CHECK(mesh.status == 1);
+    CHECK(has(mesh.err, "this is a surface (TSurf)"));
+    const Outcome unknown = call({"convert", box, folder / "s.xyz"});
+    CHECK(unknown.status == 2);
+    CHECK(has(unknown.err, ".vtk, .msh or .mesh"));
+    CHECK(has(unknown.err, ".obj, .stl, .off, .ply or .ts"));
+  }
+
+  TEST_CASE("optimize: --ideal gives the ideal elements by a mesh of the same connectivity") {
+    Folder folder;
+    Mesh rest = boxMesh({0, 0, 0}, {3, 1, 2}, {2, 2, 2});
+    Mesh bent;
+    bent.x = rest.x;
+    bent.tets = cellsOf(rest).tets;
+    bent.x[13] = {1.2, .8, .4};
+    const std::string in = folder.file("in.vtk", vtkText(bent)), out = folder / "out.msh";
+    const std::string ideal = folder.file("rest.mesh", meditText(rest, {}));
+    const Outcome o = call({"optimize", in, "-o", out, "--ideal", ideal, "--max-disp", "1e-6"});
+    REQUIRE_MESSAGE(o.status == 0, o.err);
+    CHECK(norm(readMesh(out).x[13] - Vec3{1.5, .5, 1}) < 1e-5);  // at rest again
+    CHECK(has(o.out, "against the regular tetrahedron"));
+    auto refused = [&](const std::string& mesh, const std::string& other, const char* what) {
+      const Outcome r = call({"optimize", mesh, "-o", folder / "x.vtk", "--ideal", other});
+      CHECK(r.status == 1);
+      CHECK_MESSAGE(has(r.err, what), r.err);
+    };
+    const Mesh larger = boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 3});
+    refused(in, folder.file("l.vtk", vtkText(larger)), "needs a mesh of the same connectivity");
+    Mesh other = bent;
+    other.tets[5] = bent.tets[7];
+    refused(in, folder.file("o.vtk", vtkText(other)), "tetrahedron 5 has other nodes");
+    other = bent;
+    other.x[13] = {3.3, 1.9, 2.7};
+    refused(in, folder.file("i.vtk", vtkText(other)), "tetrahedra are inverted");
+    refused(folder.file("r.vtk", vtkText(rest)), in, "has computational elements");
+    CHECK(!fs::exists(folder / "x.vtk"));
+  }
+
+  TEST_CASE("optimize: required vertices and labelled faces stay where they are") {
+    Folder folder;
+    Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2});
+    Mesh plain;
+    plain.x = M.x;
+    plain.x[13] = {.6, .45, .52};
+    plain.tets = cellsOf(M).tets;
+    const std::string out = folder / "out.mesh";
+    auto moved = [&](const std::string& text) {
+      REQUIRE(call({"optimize", folder.file("in.mesh", text), "-o", out}).status == 0);
+      return norm(readMesh(out).x[13] - plain.x[13]);
+    };
+    CHECK(moved(meditText(plain, {})) > .05);
+    CHECK(moved(meditText(plain, {13})) == 0);
+    CHECK(readMeshFile(out).required == std::vector<int>{13});
+    Mesh halved = halvedBox();  // its node 13 is on the labelled plane
+    plain.faceLabel.clear();
+    std::string text = meditText(plain, {});
+    std::string faces;
+    int count = 0;
+    for (const std::array<int, 3>& f : surfaceFaces(halved, 1)) {
+      for (int n : f) faces += std::to_string(n + 1) + " ";
+      faces += "5\n";
+      ++count;
+    }
+    text = with(text, "\nEnd", "\nTriangles\n" + std::to_string(count) + "\n" + faces + "End");
+    CHECK(moved(text) == 0);
+  }
+}
+
 TEST_SUITE("command line") {
   TEST_CASE("exit status: 0 done, 1 an error, 2 wrong usage") {
     Folder folder;
@@ -404,7 +918,9 @@ TEST_SUITE("command line") {
         {"box", "-o", mesh, "--size", "1", "1", "1m"},
         {"box", "-o", mesh, "--size", "1", "1", "inf"},
         {"box", "-o", mesh, "extra"}, {"box", "-o", mesh, "--colour", "red"},
-        {"box", "-o", mesh, "-o", mesh}, {"box", "-o", folder / "m.msh"}, {"stats"},
+        {"box", "-o", mesh, "-o", mesh}, {"box", "-o", folder / "m.obj"},
+        {"box", "-o", folder / "m"}, {"stats"},
+        {"convert", mesh}, {"convert", mesh, folder / "m.txt"}, {"optimize", mesh, "--ideal", mesh},
         {"stats", mesh, mesh}, {"insert", mesh, "-o", mesh, "--lc", "1"},
         {"insert", mesh, "s.obj", "--lc", "1"}, {"insert", mesh, "s.obj", "-o", mesh},
         {"insert", mesh, "s.obj", "-o", mesh, "--lc", "0.1x"}, {"optimize", mesh}};
@@ -416,6 +932,28 @@ TEST_SUITE("command line") {
       CHECK(o.err.compare(0, 9, "meccano: ") == 0);
       CHECK(has(o.err, "--help"));
       CHECK(std::count(o.err.begin(), o.err.end(), '\n') == 1);
+    }
+  }
+
+  TEST_CASE("wrong usage: each message") {
+    const std::pair<std::vector<std::string>, const char*> rules[] = {
+        {{}, "a command is missing"},
+        {{"bxo"}, "there is no command 'bxo'"},
+        {{"box", "--colour"}, "there is no option --colour"},
+        {{"box", "-o", "a.vtk", "-o", "b.vtk"}, "-o is given twice"},
+        {{"box", "-o", "a.vtk", "--size", "1", "2"}, "--size needs X Y Z"},
+        {{"box", "-o", "a.vtk", "--cells", "1", "2", "x"}, "'x' is no integer for --cells"},
+        {{"box", "-o", "a.vtk", "--size", "1", "2", "x"}, "'x' is no number for --size"},
+        {{"box", "-o", "a.vtk", "--size", "1", "2", "inf"}, "--size must be finite"},
+        {{"box"}, "the output is missing: -o OUT"},
+        {{"box", "-o", "a.stl"}, "'a.stl' does not end in .vtk, .msh or .mesh"},
+        {{"box", "a.vtk", "-o", "a.vtk"}, "'a.vtk' is too much, no file is read"},
+        {{"stats"}, "needed: MESH, given: 0 files"},
+        {{"convert", "a.vtk", "a.doc"}, "'a.doc' ends neither in .vtk, .msh or .mesh (meshes)"}};
+    for (const auto& [words, what] : rules) {
+      const Outcome o = call(words);
+      CHECK(o.status == 2);
+      CHECK_MESSAGE(has(o.err, what), o.err);
     }
   }
 
@@ -495,8 +1033,9 @@ TEST_SUITE("command line") {
     refused(stage, S, "without its geometry");
     refused(box, empty, "empty");
     refused(box, folder / "none.obj", "cannot be read");
-    refused(S, S, "no VTK legacy file");
-    CHECK(has(call({"insert", box, S, S, "-o", out, "--lc", ".1"}).err, "2 surfaces are given"));
+    refused(S, S, "this is a surface (OBJ), and a mesh is needed");
+    refused(box, box, "this is a mesh (VTK legacy), and a surface is needed");
+    CHECK(call({"insert", box, S, S, "-o", out, "--lc", ".1", "--quiet"}).status == 1);
     CHECK(has(call({"insert", box, S, "-o", folder / "no/x.vtk", "--lc", ".1"}).err, "no/x.vtk"));
     CHECK(has(call({"insert", box, S, "-o", out, "--lc", ".1", "--stages", folder / "no/x"}).err,
               "no/x-original.vtk"));

@@ -1,0 +1,3 @@
+GOCAD PLine 1
+VRTX 1 0 0 0
+END

@@ -1,0 +1,275 @@
+// SPDX-License-Identifier: MIT
+//
+// Real surfaces (`make stress-real`): the fault sets, single faults and scans of ../shared/data,
+// each row inserted by the library and held against its figures. Where that directory is absent it
+// says so and passes: the files are not ours to give.
+#include <ctime>
+#include <filesystem>
+#include <iostream>
+
+#define MECCANO_NO_MAIN
+#include "../main.cpp"
+#include "shapes.hpp"
+
+namespace {
+
+using namespace meccano;
+using app::format, app::readSurfaces, app::vtkText, app::writeFiles;
+namespace fs = std::filesystem;
+
+constexpr const char* help =
+    "usage: stress_real [TEXT ...] [--data DIR] [--list] [--exact] [--write PREFIX] [--verbose]\n"
+    "  TEXT            rows whose name contains one of the texts; default all that are not slow\n"
+    "  --data DIR      default ../shared/data\n"
+    "  --list          names the rows, and runs nothing\n"
+    "  --exact         TEXT is the whole name\n"
+    "  --write PREFIX  writes each mesh to PREFIX<name>.vtk\n"
+    "  --verbose       progress on standard error\n"
+    "Exit status: 0 all figures met, 1 not, 2 wrong usage.\n";
+
+/// How the surfaces of a row follow each other.
+enum class Order { asListed, reversed, largestFirst };
+
+/// What a row must reach; 0 asks for nothing but a valid mesh.
+struct Figures {
+  double min = 0, mean = 0;
+  double hausdorff = 0;  // at most, of l_c
+  double shift = 0;      // tangential, at most, of h
+};
+
+/// One call of insertSurfaces: data, box, options and what must come of it.
+struct Row {
+  std::string name;
+  std::vector<std::string> files;  // in the data directory; a directory stands for all its .obj
+  double lc = 0;                   // InsertOptions::lc
+  double lcOfDiagonal = 0;         // or this part of the diagonal of the surfaces' box
+  double marginOfLc = 2;           // the domain's margin around that box, of l_c
+  double marginOfDiagonal = 0;     // or of its diagonal
+  Figures figures = {};
+  std::vector<std::string> refused = {};  // not empty: must be refused, the message has all these
+  Order order = Order::asListed;
+  bool slow = false;  // run only where named
+  bool valid = true;  // false: either outcome will do
+};
+
+std::vector<Row> rows() {
+  std::vector<Row> all;
+  const Figures set{.35, .89, .2, 0};
+  const std::pair<const char*, Order> orders[] = {{"", Order::asListed},
+                                                  {" reversed", Order::reversed},
+                                                  {" largest first", Order::largestFirst}};
+  for (const char* files : {"cfm_mojave", "cfm_puente_hills", "cfm_san_bernardino"})
+    for (const auto& [suffix, order] : orders) {
+      Row row{files + std::string(" 1200") + suffix, {files}, 1200};
+      row.figures = set, row.order = order;
+      all.push_back(row);
+      row.name = files + std::string(" 2400") + suffix, row.lc = 2400, row.figures = {};
+      all.push_back(row);
+    }
+  Row crossing{"cfm_neg_crossing_pair", {"cfm_neg_crossing_pair"}, 1200};
+  crossing.refused = {"East_Shoreline", "Southern_San_Andreas", "near ("};
+  all.push_back(crossing);
+  for (double lc : {1200., 600., 300.}) {
+    Row coyote{"coyote " + std::to_string(static_cast<int>(lc)),
+               {"cfm_puente_hills/WTRA-PHTS-COYT-Puente_Hills_Thrust_fault-CFM2.obj"},
+               lc};
+    coyote.slow = true;
+    all.push_back(coyote);
+  }
+  Row fine{"cfm_mojave 500", {"cfm_mojave"}, 500};
+  fine.figures = {.25, 0, 0, 0}, fine.slow = true;
+  all.push_back(fine);
+  return all;
+}
+
+double areaOf(const TriangleSurface& S) {
+  double area = 0;
+  for (const auto& t : S.triangles)
+    area += .5 * norm(cross(S.points[t[1]] - S.points[t[0]], S.points[t[2]] - S.points[t[0]]));
+  return area;
+}
+
+std::vector<TriangleSurface> surfacesOf(const Row& row, const std::string& data) {
+  std::vector<std::string> files;
+  for (const std::string& file : row.files) {
+    if (!fs::is_directory(data + "/" + file)) {
+      files.push_back(data + "/" + file);
+      continue;
+    }
+    std::vector<std::string> found;
+    for (const fs::directory_entry& entry : fs::directory_iterator(data + "/" + file))
+      if (entry.path().extension() == ".obj") found.push_back(entry.path().string());
+    std::sort(found.begin(), found.end());
+    files.insert(files.end(), found.begin(), found.end());
+  }
+  std::vector<TriangleSurface> surfaces;
+  std::vector<std::string> notes;
+  for (const std::string& file : files)
+    for (const TriangleSurface& S : readSurfaces(file, notes)) surfaces.push_back(S);
+  if (row.order == Order::reversed) std::reverse(surfaces.begin(), surfaces.end());
+  if (row.order == Order::largestFirst)
+    std::stable_sort(
+        surfaces.begin(), surfaces.end(),
+        [](const TriangleSurface& a, const TriangleSurface& b) { return areaOf(a) > areaOf(b); });
+  return surfaces;
+}
+
+/// A box of cubic cells, 8 h wide where l_c is given, with the row's margin at least.
+Mesh boxAround(const std::vector<TriangleSurface>& surfaces, Row& row) {
+  Vec3 lo{1e300, 1e300, 1e300}, hi{-1e300, -1e300, -1e300};
+  for (const TriangleSurface& S : surfaces)
+    for (Vec3 p : S.points) {
+      lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
+      hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
+    }
+  const double diagonal = norm(hi - lo);
+  if (row.lcOfDiagonal > 0) row.lc = row.lcOfDiagonal * diagonal;
+  const double margin =
+      row.marginOfDiagonal > 0 ? row.marginOfDiagonal * diagonal : row.marginOfLc * row.lc;
+  const Vec3 extent = hi - lo + 2 * margin * Vec3{1, 1, 1};
+  const double edge = row.lc > 0 ? 8 * .98 * row.lc / std::sqrt(3.)
+                                 : std::max({extent.x, extent.y, extent.z}) / 6;
+  const std::array<int, 3> cells{static_cast<int>(std::ceil(extent.x / edge)),
+                                 static_cast<int>(std::ceil(extent.y / edge)),
+                                 static_cast<int>(std::ceil(extent.z / edge))};
+  const Vec3 size{edge * cells[0], edge * cells[1], edge * cells[2]};
+  return boxMesh(.5 * (lo + hi) - .5 * size, size, cells);
+}
+
+/// What of the figures is not met; empty: all is.
+std::string missed(const Row& row, const Mesh& M, const std::vector<InsertReport>& reports) {
+  std::string text;
+  auto demand = [&](bool holds, const std::string& what) {
+    if (!holds) text += (text.empty() ? "" : ", ") + what;
+  };
+  const QualityStatistics& q = reports.back().smoothed;
+  demand(row.refused.empty(), "was to be refused");
+  demand(shapes::countInverted(M) == 0, "inverted");
+  demand(q.min >= row.figures.min, format("min < %.2f", row.figures.min));
+  demand(q.mean >= row.figures.mean, format("mean < %.2f", row.figures.mean));
+  for (const InsertReport& r : reports) {
+    const double h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) * std::exp2(-cubeLevel(M, r.lc) / 3);
+    const bool isCoyote = M.surfaces[r.surface - 1].name.find("PHTS-COYT") != std::string::npos;
+    const double hausdorff = isCoyote ? .3 : row.figures.hausdorff;  // its lobes overlap
+    if (row.figures.hausdorff > 0)
+      demand(r.hausdorff <= hausdorff * r.lc, format("H/lc %.2f", r.hausdorff / r.lc));
+    if (row.figures.shift > 0)
+      demand(r.tangentialShift <= row.figures.shift * h,
+             format("shift/h %.2f", r.tangentialShift / h));
+  }
+  return text;
+}
+
+/// The last line of a row with a mesh.
+std::string resultLine(const Mesh& M, const std::vector<InsertReport>& reports) {
+  double hausdorff = 0, shift = 0, least = 1e300;
+  for (const InsertReport& r : reports) {
+    const double h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) * std::exp2(-cubeLevel(M, r.lc) / 3);
+    hausdorff = std::max(hausdorff, r.hausdorff / r.lc);
+    shift = std::max(shift, r.tangentialShift / h);
+    least = std::min(least, r.lc);
+  }
+  const QualityStatistics& q = reports.back().smoothed;
+  return format("%d surfaces, %7d tets, inverted %d, min %.3f mean %.3f, l_c from %.4g, H/lc %.2f, "
+                "shift/h %.2f",
+                static_cast<int>(reports.size()), q.tetrahedra, q.inverted, q.min, q.mean, least,
+                hausdorff, shift);
+}
+
+struct Arguments {
+  std::string data = "../shared/data", write;
+  bool list = false, exact = false, verbose = false, usage = false;
+  std::vector<std::string> texts;
+};
+
+bool run(Row row, const Arguments& a) {
+  const std::clock_t start = std::clock();
+  std::string text, fault;
+  Mesh M;
+  try {
+    const std::vector<TriangleSurface> surfaces = surfacesOf(row, a.data);
+    M = boxAround(surfaces, row);
+    InsertOptions options;
+    options.lc = row.lc;
+    if (a.verbose)
+      options.onProgress = [](const std::string& line) { std::cerr << line << std::endl; };
+    const std::vector<InsertReport> reports = insertSurfaces(M, surfaces, options);
+    text = resultLine(M, reports);
+    fault = missed(row, M, reports);
+    for (const InsertReport& r : reports) {
+      if (a.verbose)
+        std::cout << format("  %-60s tets %7d min %.3f -> %.3f mean %.3f H/lc %.2f way %d\n",
+                            M.surfaces[r.surface - 1].name.c_str(), r.smoothed.tetrahedra,
+                            r.original.min, r.smoothed.min, r.smoothed.mean, r.hausdorff / r.lc,
+                            r.way);
+      for (const std::string& w : r.warnings)
+        std::cout << "  " << M.surfaces[r.surface - 1].name << ": " << w << "\n";
+    }
+    if (!a.write.empty()) writeFiles({{a.write + row.name + ".vtk", vtkText(M)}});
+  } catch (const Error& error) {
+    text = std::string("refused: ") + error.what();
+    if (row.refused.empty() && row.valid) fault = "was to be inserted";
+    for (const std::string& part : row.refused)
+      if (text.find(part) == std::string::npos) fault += " no '" + part + "' in the message";
+  }
+  const double seconds = static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
+  std::cout << format("%-36s", row.name.c_str()) << text << format(", %.0f s  ", seconds)
+            << (fault.empty() ? "ok" : "BAD: " + fault) << std::endl;
+  return fault.empty();
+}
+
+Arguments parse(int argc, char** argv) {
+  Arguments a;
+  for (int i = 1; i < argc; ++i) {
+    const std::string arg = argv[i];
+    if (arg == "--list")
+      a.list = true;
+    else if (arg == "--exact")
+      a.exact = true;
+    else if (arg == "--verbose")
+      a.verbose = true;
+    else if (arg == "--data" && i + 1 < argc)
+      a.data = argv[++i];
+    else if (arg == "--write" && i + 1 < argc)
+      a.write = argv[++i];
+    else if (arg[0] == '-')
+      a.usage = true;
+    else
+      a.texts.push_back(arg);
+  }
+  return a;
+}
+
+bool isSelected(const Row& row, const Arguments& a) {
+  if (a.texts.empty()) return !row.slow || a.list;
+  for (const std::string& text : a.texts)
+    if (row.name == text || (!row.slow && row.name.find(text) != std::string::npos && !a.exact))
+      return true;
+  return false;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  const Arguments a = parse(argc, argv);
+  if (a.usage) {
+    std::cerr << help;
+    return 2;
+  }
+  if (!fs::is_directory(a.data)) {
+    std::cout << "stress-real skipped: there is no " << a.data << std::endl;
+    return 0;
+  }
+  int selected = 0, met = 0;
+  for (const Row& row : rows()) {
+    if (!isSelected(row, a)) continue;
+    ++selected;
+    if (a.list)
+      std::cout << row.name << (row.slow ? " (slow)" : "") << std::endl;
+    else
+      met += run(row, a);
+  }
+  if (a.list) return 0;
+  std::cout << met << " of " << selected << " rows met" << std::endl;
+  return met == selected ? 0 : 1;
+}
