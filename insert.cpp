@@ -147,19 +147,51 @@ Vec3 gamma(const Curve& C, double s) {
 
 namespace {
 
-/// Cell of the locator's grid along one axis.
-int gridCell(double coordinate, int size) {
-  return coordinate > 0 ? static_cast<int>(std::min(coordinate * size, size - 1.)) : 0;
+/// Cell of a grid along one axis.
+int gridCell(double offset, const Parametrization::Grid& G) {
+  return offset > 0 ? static_cast<int>(std::min(offset / G.cell, G.size - 1.)) : 0;
 }
 
 /// Range of cells that the triangle's box meets, widened by rounding.
-std::array<int, 4> gridRange(const Parametrization& P, const std::array<int, 3>& t) {
-  constexpr double margin = 1e-9;  // in 𝓤: far above rounding, far below a cell
-  const Vec2 a = P.u[t[0]], b = P.u[t[1]], c = P.u[t[2]];
-  return {gridCell(std::min({a.x, b.x, c.x}) - margin, P.gridSize),
-          gridCell(std::max({a.x, b.x, c.x}) + margin, P.gridSize),
-          gridCell(std::min({a.y, b.y, c.y}) - margin, P.gridSize),
-          gridCell(std::max({a.y, b.y, c.y}) + margin, P.gridSize)};
+std::array<int, 4> gridRange(const Parametrization& P, const Parametrization::Grid& G,
+                             const std::array<int, 3>& t) {
+  const double margin = 1e-6 * G.cell;  // far above rounding
+  const Vec2 a = P.u[t[0]] - G.low, b = P.u[t[1]] - G.low, c = P.u[t[2]] - G.low;
+  return {gridCell(std::min({a.x, b.x, c.x}) - margin, G),
+          gridCell(std::max({a.x, b.x, c.x}) + margin, G),
+          gridCell(std::min({a.y, b.y, c.y}) - margin, G),
+          gridCell(std::max({a.y, b.y, c.y}) + margin, G)};
+}
+
+/// Fills grid g with these triangles; crowded cells get grids of their own, their triangles in
+/// `waiting`.
+void fillGrid(Parametrization& P, std::size_t g, const std::vector<int>& triangles,
+              std::vector<std::vector<int>>& waiting) {
+  constexpr std::size_t crowded = 16;        // triangles; a vertex may well have 12
+  constexpr double smallestCell = 1e-14;     // in 𝓤, where doubles end
+  constexpr std::size_t fewerBy = 3, of = 4; // a cell that holds nearly all is not cut again
+  P.grids[g].first = static_cast<int>(P.gridOf.size());
+  const Parametrization::Grid G = P.grids[g];
+  std::vector<std::vector<int>> cells(std::size_t(G.size) * G.size);
+  for (int t : triangles) {
+    const std::array<int, 4> r = gridRange(P, G, P.triangles[t]);
+    for (int j = r[2]; j <= r[3]; ++j)
+      for (int i = r[0]; i <= r[1]; ++i) cells[std::size_t(j) * G.size + i].push_back(t);
+  }
+  for (std::size_t c = 0; c < cells.size(); ++c) {
+    const bool worth = cells[c].size() * of < triangles.size() * fewerBy || triangles.size() > 64;
+    P.gridOf.push_back(0);
+    if (cells[c].size() > crowded && worth && G.cell > smallestCell) {
+      const int i = static_cast<int>(c) % G.size, j = static_cast<int>(c) / G.size;
+      const int size = std::max(2, static_cast<int>(std::sqrt(cells[c].size())));
+      P.gridOf.back() = static_cast<int>(P.grids.size());
+      P.grids.push_back({G.low + Vec2{i * G.cell, j * G.cell}, G.cell / size, size, 0});
+      waiting.push_back(std::move(cells[c]));
+    } else {
+      P.gridTriangles.insert(P.gridTriangles.end(), cells[c].begin(), cells[c].end());
+    }
+    P.gridStart.push_back(static_cast<int>(P.gridTriangles.size()));
+  }
 }
 
 }  // namespace
@@ -167,22 +199,26 @@ std::array<int, 4> gridRange(const Parametrization& P, const std::array<int, 3>&
 void buildLocator(Parametrization& P) {
   const int count = static_cast<int>(P.triangles.size());
   P.gridSize = std::clamp(static_cast<int>(std::sqrt(count)), 1, 1024);
-  P.gridStart.assign(P.gridSize * P.gridSize + 1, 0);
-  auto forCells = [&](int t, auto visit) {
-    const std::array<int, 4> r = gridRange(P, P.triangles[t]);
-    for (int j = r[2]; j <= r[3]; ++j)
-      for (int i = r[0]; i <= r[1]; ++i) visit(j * P.gridSize + i);
-  };
-  for (int t = 0; t < count; ++t) forCells(t, [&](int c) { ++P.gridStart[c + 1]; });
-  std::partial_sum(P.gridStart.begin(), P.gridStart.end(), P.gridStart.begin());
-  P.gridTriangles.resize(P.gridStart.back());
-  std::vector<int> next(P.gridStart.begin(), P.gridStart.end() - 1);
-  for (int t = 0; t < count; ++t) forCells(t, [&](int c) { P.gridTriangles[next[c]++] = t; });
+  P.grids.assign(1, {{0, 0}, 1. / P.gridSize, P.gridSize, 0});
+  P.gridOf.clear();
+  P.gridTriangles.clear();
+  P.gridStart.assign(1, 0);
+  std::vector<std::vector<int>> waiting(1, std::vector<int>(count));
+  std::iota(waiting[0].begin(), waiting[0].end(), 0);
+  for (std::size_t g = 0; g < P.grids.size(); ++g) {
+    const std::vector<int> triangles = std::move(waiting[g]);
+    fillGrid(P, g, triangles, waiting);
+  }
 }
 
 Location locate(const Parametrization& P, Vec2 u) {
   constexpr double tolerance = 1e-9;  // barycentric: a point on the border of 𝓤 may round outside
-  const int cell = gridCell(u.y, P.gridSize) * P.gridSize + gridCell(u.x, P.gridSize);
+  int cell = 0;
+  for (int g = 0, first = 1; first || g > 0; first = 0, g = P.gridOf[cell]) {
+    const Parametrization::Grid& G = P.grids[g];
+    const Vec2 at = u - G.low;
+    cell = G.first + gridCell(at.y, G) * G.size + gridCell(at.x, G);
+  }
   Location best{-1, {0, 0, 0}};
   double bestInside = -tolerance;
   for (int i = P.gridStart[cell]; i < P.gridStart[cell + 1]; ++i) {
@@ -2844,7 +2880,7 @@ double predictedTets(const Mesh& M, const BoundaryDistance& d, double eps) {
 /// [§2, Algorithm 1, lines 5 to 9] Refines and projects until the distance is at most eps. Returns
 /// the number of passes.
 int refineToDistance(Mesher& W, double eps) {
-  constexpr int mostLevels = 45;  // [choice] 2^15 edges along one of a cube
+  constexpr int mostLevels = 90;  // [choice] 2^30 edges along one of a cube
   constexpr int maxPasses = 3 * mostLevels;  // a bisection need not split the face itself
   Bisection B(W.M);
   for (int pass = 0; pass < maxPasses; ++pass) {
@@ -2873,18 +2909,23 @@ int refineToDistance(Mesher& W, double eps) {
 /// Untangles with the boundary fixed, [departure] and where a few elements stay inverted, bisects
 /// them for more freedom. Returns the number of inverted elements left.
 int untangleFixed(Mesher& W, bool smooth) {
-  constexpr int maxRounds = 8;
+  constexpr int maxRounds = 10, patience = 2;  // rounds without fewer inverted elements
   OptimizeOptions optimize = W.options.optimize;
   optimize.starDelta = true;
   optimize.globalDescent = false;
   if (!smooth) optimize.power = 1;
-  int fewest = static_cast<int>(W.M.tets.size()) + 1;
+  int fewest = static_cast<int>(W.M.tets.size()) + 1, waited = 0;
+  for (int k = 0; k < maxRounds; ++k) {
+    Bisection B(W.M);
+    if (splitFlatCorners(B) == 0) break;
+  }
   for (int round = 0;; ++round) {
     optimize.fixed = boundaryNodes(W.M);
     const int inverted = optimizeMesh(W.M, optimize).inverted;
     W.progress("fixed boundary: " + sizeText(W.M) + ", " + std::to_string(inverted) + " inverted");
-    if (inverted == 0 || inverted >= fewest || round == maxRounds) return inverted;
-    fewest = inverted;
+    if (inverted >= fewest) ++waited;
+    if (inverted == 0 || waited == patience || round == maxRounds) return inverted;
+    fewest = std::min(fewest, inverted);
     Bisection B(W.M);
     const std::vector<double> q = qualities(W.M);
     for (std::size_t E = 0; E < q.size(); ++E)
@@ -2908,11 +2949,9 @@ double movedFaceDistance(const Mesh& M, const BoundaryFace& face, double enough)
   return most;
 }
 
-constexpr double guardedEps = .8;  // [choice] of ε: farther faces must not get worse by sliding
-
-/// Algorithm 2 on all nodes; a boundary node is not moved where a face beside it gets worse than
-/// the guard allows.
-OptimizeReport slideWithin(Mesher& W, double eps) {
+/// Algorithm 2 on all nodes; a boundary node is not moved where a face beside it gets farther than
+/// allowed and worse.
+OptimizeReport slideWithin(Mesher& W, double allowed, bool last) {
   Mesh& M = W.M;
   std::vector<std::vector<BoundaryTriangle>> facesAt(M.x.size());
   for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
@@ -2921,15 +2960,15 @@ OptimizeReport slideWithin(Mesher& W, double eps) {
         for (int j = 1; j < 4; ++j) facesAt[M.tets[E][(i + j) % 4]].push_back({E, i});
   OptimizeOptions optimize = W.options.optimize;
   optimize.globalDescent = false;
-  const double allowed = guardedEps * eps;
+  optimize.starDelta = true;
+  if (!last) optimize.power = 1;
   optimize.accept = [&](int n, Vec3 x, Vec2 parameter) {
     bool good = true;
     for (const BoundaryTriangle& at : facesAt[n]) {
-      const double before = movedFaceDistance(M, boundaryFace(M, at), allowed);
       std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
       const double after = movedFaceDistance(M, boundaryFace(M, at), allowed);
       std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
-      good = after <= allowed || after < before;
+      good = after <= allowed || after < movedFaceDistance(M, boundaryFace(M, at), allowed);
       if (!good) break;
     }
     return good;
@@ -2937,15 +2976,14 @@ OptimizeReport slideWithin(Mesher& W, double eps) {
   return optimizeMesh(M, optimize);
 }
 
+/// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide far,
+/// and what they leave is refined; in the end hardly any face exceeds ε.
+constexpr double guard[] = {3, 1.5, .8, .8, .8, .8};
+
 /// qualityOptimization with ∂Ω prepared.
 void optimizeQuality(Mesher& W) {
-  constexpr int maxRounds = 6;
   const double eps = sampledEps * W.options.eps;
   placeInterior(W.M);
-  for (int k = 0; k < maxRounds; ++k) {
-    Bisection B(W.M);
-    if (splitFlatCorners(B) == 0) break;
-  }
   if (const int left = untangleFixed(W, W.options.fixedBoundary); left > 0)
     throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
                       " elements stay inverted with the boundary fixed; lower eps, or give a "
@@ -2954,24 +2992,27 @@ void optimizeQuality(Mesher& W) {
   W.report.untangled = qualityStatistics(W.M);
   W.stage("untangled");
   if (W.options.fixedBoundary) return;
+  constexpr int fewInverted = 60;
   Mesh valid = W.M;
   double best = 0;
-  for (int round = 1; round <= maxRounds; ++round) {
-    const OptimizeReport o = slideWithin(W, eps);
+  const int rounds = static_cast<int>(std::size(guard));
+  for (int round = 1; round <= rounds; ++round) {
+    const bool last = guard[round - 1] < 1;
+    const OptimizeReport o = slideWithin(W, guard[round - 1] * eps, last);
     const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
     W.progress("round " + std::to_string(round) + ": " + sizeText(W.M) + ", min " +
                number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " +
                number(d.largest()) + ", " + std::to_string(o.inverted) + " inverted");
-    if (o.inverted == 0 && d.largest() <= eps && o.minQ > best) {
-      best = o.minQ, valid = W.M, W.report.rounds = round;
-      break;
+    const bool within = d.largest() <= eps;
+    if (!within) refineToDistance(W, eps);
+    if (!within || o.inverted > 0) {
+      // a few that stay are left to the next round, whose boundary slides
+      if (untangleFixed(W, false) > fewInverted) break;
     }
-    if (o.inverted > 0) break;
-    refineToDistance(W, eps);
-    if (untangleFixed(W, false) > 0) break;
     const QualityStatistics q = qualityStatistics(W.M);
-    if (q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
+    if (q.inverted == 0 && q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
       best = q.min, valid = W.M, W.report.rounds = round;
+    if (within && last && q.inverted == 0) break;
   }
   W.M = std::move(valid);
 }

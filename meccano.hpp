@@ -121,8 +121,16 @@ struct Parametrization {
   std::vector<Vec2> u;                        // [points], in 𝓤 (the unit square)
   std::string name = {};
   int rim = 0;  // number of its rim among Mesh::curves; 0: a boundary patch
-  // Uniform grid over 𝓤 for the point location; derived data, made by buildLocator().
-  int gridSize = 0;
+  // Grids for the point location, derived data made by buildLocator(). The first is over 𝓤; where
+  // the map crowds triangles into a cell, that cell has a grid of its own.
+  int gridSize = 0;  // of the first grid along each axis; 0: not made
+  struct Grid {
+    Vec2 low;
+    double cell;      // edge of a cell
+    int size, first;  // along each axis; cells first .. first + size²
+  };
+  std::vector<Grid> grids;
+  std::vector<int> gridOf;  // [cells of all grids], number of the grid over a cell, 0: none
   // Triangles of cell c: gridTriangles[gridStart[c] .. gridStart[c+1]).
   std::vector<int> gridStart, gridTriangles;
 };

@@ -629,6 +629,8 @@ bool staysUnfolded(Smoother& S, int n, Vec2 parameter) {
 /// of 1e-8 by truncation and by cancellation.
 constexpr double differenceStep = 1e-4;
 
+constexpr int rejectedSteps = 3;  // OptimizeOptions::accept is asked for so many, each half the last
+
 /// [§3.7.3, eq. (10), (11)] A surface or curve node: a Newton step in its parameters. Returns the
 /// displacement.
 ///   [departure] Armijo's condition alone: at the kinks of ϕ and γ the curvature condition may hold
@@ -656,10 +658,17 @@ double visitSliding(Smoother& S, int n, const Edges& edges) {
     return F(length * p) <= o.f + wolfeC1 * length * d.slope &&
            staysUnfolded(S, n, placeOf(S.M, n, u + length * p).parameter);
   };
-  for (int k = 0; !isStep(t); t /= 2)
+  const auto isAccepted = [&](const Place& at) {
+    return !S.options.accept || S.options.accept(n, at.x, at.parameter);
+  };
+  for (int k = 0, rejected = 0;; t /= 2) {
+    if (isStep(t)) {
+      if (isAccepted(placeOf(S.M, n, u + t * p))) break;
+      if (++rejected == rejectedSteps) return 0;
+    }
     if (++k == wolfeEvaluations) return 0;
+  }
   const Place at = placeOf(S.M, n, u + t * p);
-  if (S.options.accept && !S.options.accept(n, at.x, at.parameter)) return 0;
   S.M.x[n] = at.x;
   S.M.parameter[n] = at.parameter;
   return norm(at.x - x);
