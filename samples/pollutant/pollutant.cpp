@@ -4,8 +4,7 @@
 // it; its concentration is read off on the inserted layers. A host of the library: it needs
 // meccano.hpp, insert.cpp and optimize.cpp, and nothing else.
 //
-//   1 mesh -> 2 P1 elements -> 3 wind [34, 35] -> 4 transport [36-38] -> 5 solver [39, 40] -> 6
-//   output
+//   1 mesh, 2 P1 elements, 3 wind [34, 35], 4 transport [36-38], 5 solver [39, 40], 6 table
 //
 // Metres, seconds, grams. Nodes are n, elements E; a Field is a number per node. Reading meshes and
 // drawing pictures is in files.hpp.
@@ -36,6 +35,7 @@ struct Settings {
   std::vector<double> outputs{300, 1800, 3600};  // s, as far as they are before the end
   bool limit = true;                             // see Transport::limit()
   double top = 8000, eps = 0, lc = 0;            // of a mesh made here, m
+  std::vector<double> cells{0, 0, 0};  // its cubes; 0: near-cubic, 8 along the longer side
 };
 
 // ==== 1. The mesh ===============================================================================
@@ -53,6 +53,7 @@ Nodes islandMesh(const std::vector<std::string>& files, const Settings& s, std::
   auto tell = [&](const std::string& line) { progress << line << std::endl; };
   meccano::Terrain terrain = readAsc(files[0]);
   terrain.top = s.top;
+  for (int i = 0; i < 3; ++i) terrain.cells[i] = static_cast<int>(std::min(s.cells[i], 1e6));
   meccano::MesherOptions mesher;
   mesher.eps = s.eps > 0 ? s.eps : terrainEps(terrain);
   mesher.onProgress = tell;
@@ -72,7 +73,7 @@ Nodes islandMesh(const std::vector<std::string>& files, const Settings& s, std::
 /// The mesh with its elements' volumes and gradients, checked.
 struct Domain : Nodes {
   std::vector<double> volume;             // [tets], m^3
-  std::vector<std::array<Vec3, 4>> grad;  // [tets], grad N of the four corners, 1/m
+  std::vector<std::array<Vec3, 4>> grad;  // [tets], ∇N of the four corners, 1/m
   std::vector<char> lateral, open;        // [nodes], on the sides; on the sides or the top
   Field height;                           // above the terrain, m
   int layers = 0;                         // inserted surfaces 1 .. layers
@@ -158,7 +159,7 @@ Field multiply(const SparseMatrix& A, const Field& x) {
 
 Vec3 scaled(Vec3 T, Vec3 g) { return {T.x * g.x, T.y * g.y, T.z * g.z}; }
 
-/// D_ij = int grad N_i . T grad N_j
+/// D_ij = ∫ ∇N_i·T∇N_j
 SparseMatrix stiffness(const Domain& D, Vec3 T) {
   SparseMatrix A = pattern(D);
   for (std::size_t E = 0; E < D.tets.size(); ++E)
@@ -169,7 +170,7 @@ SparseMatrix stiffness(const Domain& D, Vec3 T) {
   return A;
 }
 
-/// int N_i: the volume that belongs to a node.
+/// ∫ N_i: the volume that belongs to a node.
 Field nodeVolumes(const Domain& D) {
   Field m(D.x.size(), 0);
   for (std::size_t E = 0; E < D.tets.size(); ++E)
@@ -197,7 +198,7 @@ struct Wind {
   std::vector<Vec3> u;      // [tets], m/s
   std::vector<Vec3> nodal;  // [nodes], lumped average of u
   Field phi;
-  Field flux;           // F_i = int u . grad N_i, m^3/s: on the open boundary the outflow of node i
+  Field flux;           // F_i = ∫ u·∇N_i, m^3/s: on the open boundary the outflow of node i
   double residual = 0;  // |F| / |F of u0| over the nodes where F has to vanish
   int iterations = 0;
 };
@@ -208,12 +209,12 @@ Vec3 windDirection(const Settings& s) {
   return {-std::sin(angle), -std::cos(angle), 0};
 }
 
-/// u0 = u*/kappa ln((z + z0)/z0) above ground, at the centroids. [choice] u* such that |u0| is the
+/// u0 = u*/κ ln((z + z0)/z0) above ground, at the centroids. [choice] u* such that |u0| is the
 /// given speed at 10 m, the height at which winds are measured.
 std::vector<Vec3> logarithmicWind(const Domain& D, const Settings& s) {
   constexpr double anemometer = 10;  // m
   const Vec3 direction = windDirection(s);
-  const double overKappa = s.wind / std::log((anemometer + s.roughness) / s.roughness);  // u*/kappa
+  const double overKappa = s.wind / std::log((anemometer + s.roughness) / s.roughness);  // u*/κ
   std::vector<Vec3> u0;
   for (const std::array<int, 4>& z : D.tets) {
     const double h = (D.height[z[0]] + D.height[z[1]] + D.height[z[2]] + D.height[z[3]]) / 4;
@@ -222,7 +223,7 @@ std::vector<Vec3> logarithmicWind(const Domain& D, const Settings& s) {
   return u0;
 }
 
-/// F_i = int u . grad N_i
+/// F_i = ∫ u·∇N_i
 Field fluxes(const Domain& D, const std::vector<Vec3>& u) {
   Field F(D.x.size(), 0);
   for (std::size_t E = 0; E < D.tets.size(); ++E)
@@ -230,9 +231,9 @@ Field fluxes(const Domain& D, const std::vector<Vec3>& u) {
   return F;
 }
 
-/// The u = u0 + T grad phi nearest to u0 with int u . grad w = 0 for every w that vanishes, like
-/// phi, on the sides and the top: int T grad phi . grad w = -int u0 . grad w. The terrain is
-/// impermeable by itself, for w does not vanish there: int u . grad w = oint w u . n.
+/// The u = u0 + T∇φ nearest to u0 with ∫ u·∇w = 0 for every w that vanishes, like
+/// phi, on the sides and the top: ∫ T∇φ·∇w = -∫ u0·∇w. The terrain is
+/// impermeable by itself, for w does not vanish there: ∫ u·∇w = ∮ w u·n.
 Wind massConsistentWind(const Domain& D, const std::vector<Vec3>& u0, double ah, double av) {
   constexpr double tolerance = 1e-10;  // the transported mass is kept to this, so below the 1e-8
   constexpr int fill = 5;  // density type: 67 iterations, not 106; the transport gains nothing
@@ -310,7 +311,7 @@ std::vector<int> sourceNodes(const Domain& D, const Wind& W, const Settings& s) 
   return nodes;
 }
 
-/// The largest dt with the element Courant number dt/2 sum_i |u . grad N_i| <= 1: the time in which
+/// The largest dt with the element Courant number dt/2 Σ_i |u·∇N_i| <= 1: the time in which
 /// the wind crosses an element.
 double courantStep(const Domain& D, const std::vector<Vec3>& u) {
   double rate = 0;
@@ -329,13 +330,19 @@ struct Balance {
   double error() const { return std::abs(stored - (in - out - deposited - decayed)) / in; }
 };
 
-/// One step of least squares with Crank-Nicolson. With R = (c1 - c0)/dt + u . grad (c1 + c0)/2 the
-/// functional |dt R|^2 is least where <dt R, w + dt/2 u . grad w> = 0 for every w. Diffusion,
-/// deposition and decay are added to it in weak form, tested with w alone and taken at c1:
-///   [M + dt/2 (C + C^T) + dt^2/4 S + dt D + dt V_d M_G + dt decay M] c1
-///                                               = [M - dt/2 (C - C^T) - dt^2/4 S] c0
-/// M_ij = int N_i N_j, C_ij = int N_i u . grad N_j, S_ij = int (u . grad N_i)(u . grad N_j),
-/// D_ij = int grad N_i . K grad N_j, M_G the mass of the terrain. Symmetric, positive definite.
+/// One step of least squares [38] with Crank-Nicolson. With R = (c1 − c0)/dt + u·∇(c1 + c0)/2 the
+/// functional ∫ (dt R)² is least where ∫ dt R (w + dt/2 u·∇w) = 0 for every w. Diffusion,
+/// deposition and decay are added in weak form, tested with w alone and taken at c1:
+///   [M + dt/2 (C + Cᵀ) + dt²/4 S + dt D + dt V_d M_G + dt decay M] c1
+///                                                = [M − dt/2 (C − Cᵀ) − dt²/4 S] c0
+/// M_ij = ∫ N_i N_j, C_ij = ∫ N_i u·∇N_j, S_ij = ∫ (u·∇N_i)(u·∇N_j), D_ij = ∫ ∇N_i·K∇N_j, M_G the
+/// mass of the terrain. Symmetric and positive definite: without the last three it is the Gram
+/// matrix of w + dt/2 u·∇w.
+/// [departure] [36, 37] print more than the paper does: Crank-Nicolson for diffusion too, chemistry
+/// by operator splitting, the rise of plumes, a mesh that follows them. Here the terms beside the
+/// wind are implicit, which damps them at any dt (V_d dt is not small against the elements on the
+/// terrain), least squares sees the wind alone (second derivatives of P1 functions vanish), and the
+/// one reaction is decay of first order.
 struct Transport {
   const Domain& D;
   const Field& F;  // fluxes of the wind
@@ -343,7 +350,7 @@ struct Transport {
   const Settings& s;
   std::vector<char> fixed;  // [nodes], 1 clean inflow, 2 source
   Field value;              // there
-  Field m, mTerrain;        // int N_i over the volume, over the terrain
+  Field m, mTerrain;        // ∫ N_i over the volume, over the terrain
   SparseMatrix mass, A, B,
       inner;  // M, left and right side, the left one with identity rows where fixed
   Factor L;
@@ -370,7 +377,7 @@ Transport::Transport(const Domain& domain, const Wind& W, const std::vector<int>
   for (int n : source) value[n] = s.concentration;
   for (std::size_t E = 0; E < D.tets.size(); ++E) {
     const double V = D.volume[E];
-    std::array<double, 4> a;  // u . grad N_i
+    std::array<double, 4> a;  // u·∇N_i
     for (int i = 0; i < 4; ++i) a[i] = dot(W.u[E], D.grad[E][i]);
     for (int i = 0; i < 4; ++i)
       for (int j = 0; j < 4; ++j) {
@@ -393,8 +400,8 @@ Transport::Transport(const Domain& domain, const Wind& W, const std::vector<int>
   L = incompleteCholesky(inner);
 }
 
-/// Sums of the rows give the balance: sum_i (A c1 - B c0)_i is the change of the stored mass plus
-/// dt sum_j F_j (c0 + c1)_j / 2, what was deposited and what decayed; it vanishes at free nodes, so
+/// Sums of the rows give the balance: Σ_i (A c1 - B c0)_i is the change of the stored mass plus
+/// dt Σ_j F_j (c0 + c1)_j / 2, what was deposited and what decayed; it vanishes at free nodes, so
 /// the rows of fixed ones are what these let in beyond their advective F_j. F_j is 0 inside and on
 /// the terrain: with the mass-consistent wind the scheme keeps mass to the solver's residual.
 int Transport::step(Field& c, Balance& balance, double tolerance) const {
@@ -418,9 +425,9 @@ int Transport::step(Field& c, Balance& balance, double tolerance) const {
 }
 
 /// [departure] Least squares damps little where the local Courant number is small, across the wind
-/// and at the terrain: fronts there under- and overshoot by 15 to 30 % of the source. As in flux-
+/// and at the terrain: fronts there under- and overshoot by 10 to 30 % of the source. As in flux-
 /// corrected transport (Zalesak 1979), c is split into its average by the mass matrix,
-/// c_i - sum_j f_ij / m_i, and the fluxes f_ij = M_ij (c_i - c_j) back to it, which are taken only
+/// c_i - Σ_j f_ij / m_i, and the fluxes f_ij = M_ij (c_i - c_j) back to it, which are taken only
 /// as far as they keep c in [0, most]. What one node gains another loses, so mass is kept; where c
 /// is within the bounds nothing changes.
 void Transport::limit(Field& c, double most) const {
@@ -601,12 +608,16 @@ std::vector<Snapshot> simulate(const Domain& D, const Wind& W, const std::vector
   for (double t : s.outputs)
     if (t < s.end) stops.push_back(t);
   stops.push_back(s.end);
-  const double courant = courantStep(D, W.u);
+  const double courant = courantStep(D, W.u), longest = std::min(s.dt, courant);
+  constexpr double mostSteps = 1e6;  // a day of computing
+  if (!(s.end / longest < mostSteps))
+    throw InputError(
+        format("%g s in steps of %g s are too many; change --end or --dt", s.end, longest));
   std::vector<Snapshot> moments;
   double from = 0;
   int iterations = 0, since = 0;
   for (double to : stops) {
-    const int steps = static_cast<int>(std::ceil((to - from) / std::min(s.dt, courant)));
+    const int steps = static_cast<int>(std::ceil((to - from) / longest));
     const Transport P(D, W, source, (to - from) / steps, s);
     progress << format("%d steps of %.4g s to %g min: element Courant number %.3f\n", steps, P.dt,
                        to / 60, P.dt / courant);
@@ -645,6 +656,11 @@ std::vector<Option> optionsFor(Settings& s) {
           {"--dt", "S", "longest time step, s (Courant number 1)", above, {&s.dt}},
           {"--end", "S", "time simulated, s (3600)", above, {&s.end}},
           {"--top", "Z", "top of the box above a terrain, m (8000)", any, {&s.top}},
+          {"--cells",
+           "NX NY NZ",
+           "cubes of that box (8 along its longer side)",
+           above,
+           {&s.cells[0], &s.cells[1], &s.cells[2]}},
           {"--eps", "E", "distance from the terrain, m (.002 of the diagonal)", above, {&s.eps}},
           {"--lc", "L", "l_c of the layers, m", above, {&s.lc}}};
 }
