@@ -5,6 +5,7 @@
 # make bench      time of each stage            make samples samples/ anew from its generator
 # make pictures   samples/cube_sine/*.svg       make faults  four faults in a box, samples/faults
 # make stress-real  the surfaces of ../shared/data, where it is
+# make pollutant  Section 4.3.2 on samples/layers: wind, transport, files in build/pollutant
 CXX      ?= g++
 CXXFLAGS ?= -O2 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-sign-conversion
 EXTRA    ?=
@@ -75,6 +76,9 @@ faults: $(PROGRAM)
 	  -o samples/faults/faults.svg
 samples: $(BUILD)/samples/generate
 	$(BUILD)/samples/generate samples
+pollutant: $(BUILD)/samples/pollutant/pollutant
+	$< samples/layers/island.asc samples/layers/layer_1000.obj samples/layers/layer_2000.obj \
+	  --lc 870 -o $(BUILD)/pollutant $(ARGS)
 audit:
 	@sh tests/audit.sh
 stress bench: %: $(BUILD)/tests/%
@@ -84,6 +88,6 @@ stress-real: $(BUILD)/tests/stress_real
 clean:
 	rm -rf $(BUILD) $(PROGRAM)
 
-.PHONY: all demo pictures faults test audit asan stress stress-real bench samples clean
+.PHONY: all demo pictures faults test audit asan stress stress-real bench samples pollutant clean
 .SECONDARY:
--include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d)
+-include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d $(BUILD)/*/*/*.d)
