@@ -128,7 +128,7 @@ std::vector<TriangleSurface> surfacesOf(const Row& row, std::string data) {
 
 /// A box of cubic cells, 8 h wide where l_c is given, with the row's margin at least.
 Mesh boxAround(const std::vector<TriangleSurface>& surfaces, Row& row) {
-  if (row.sample) return boxMesh({0, 0, 0}, {4, 3, 2}, {8, 6, 4});
+  if (row.sample) return boxMesh({0, 0, 0}, {4, 3, 2}, {4, 3, 2});
   Vec3 lo{1e300, 1e300, 1e300}, hi{-1e300, -1e300, -1e300};
   for (const TriangleSurface& S : surfaces)
     for (Vec3 p : S.points) {
