@@ -3,7 +3,9 @@
 # make demo       Figure 8, beside Table I      make audit   equation -> function -> test
 # make asan       the tests with sanitizers     make stress  200 random surfaces
 # make bench      time of each stage            make samples samples/ anew from its generator
+# make pictures   samples/cube_sine/*.svg       make faults  four faults in a box, samples/faults
 # make stress-real  the surfaces of ../shared/data, where it is
+# make pollutant  Section 4.3.2 on samples/layers: wind, transport, files in build/pollutant
 CXX      ?= g++
 CXXFLAGS ?= -O2 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-sign-conversion
 EXTRA    ?=
@@ -52,15 +54,31 @@ demo: $(PROGRAM)
 	@mkdir -p $(DEMO)
 	./$(PROGRAM) box --cells 2 2 2 -o $(DEMO)/cube.vtk
 	./$(PROGRAM) insert $(DEMO)/cube.vtk samples/cube_sine/sine.obj --lc .12 \
-	  --stages $(DEMO)/cube_sine -o $(DEMO)/cube_sine.vtk > $(DEMO)/table.txt
+	  --stages $(DEMO)/cube_sine --pictures $(DEMO)/cube_sine -o $(DEMO)/cube_sine.vtk \
+	  > $(DEMO)/table.txt
 	@awk 'BEGIN { p["Table"] = "paper: original projected smoothed"; p["inverted"] = "0 58 0"; \
 	    p["min"] = "1 0 0.35"; p["max"] = "1 1 0.99"; p["mean"] = "1 0.74 0.92"; \
 	    p["std"] = "0 0.33 0.10" } \
 	  { n = split(p[$$1], c, " "); line = $$0 (n ? "   |" : ""); if (n == 3) line = line "      "; \
 	    for (i = 1; i <= n; ++i) line = line sprintf(" %10s", c[i]); print line }' $(DEMO)/table.txt
 
+# The pictures of samples/ anew: copies of the demo's, and Figure 9's two histograms.
+pictures: demo
+	cp $(DEMO)/cube_sine_*.svg samples/cube_sine
+	for s in projected smoothed; do ./$(PROGRAM) stats $(DEMO)/cube_sine-$$s.vtk \
+	  --histogram samples/cube_sine/histogram_$$s.svg > $(DEMO)/stats.txt || exit 1; done
+faults: $(PROGRAM)
+	@mkdir -p $(DEMO)
+	./$(PROGRAM) box --size 4 3 2 --cells 4 3 2 -o $(DEMO)/box.vtk
+	./$(PROGRAM) insert $(DEMO)/box.vtk $(patsubst %,samples/faults/%.ts,west east ring lobe) \
+	  --lc .12 -o $(DEMO)/faults.vtk
+	./$(PROGRAM) picture $(DEMO)/faults.vtk --colour surface --cut y=2.5 \
+	  -o samples/faults/faults.svg
 samples: $(BUILD)/samples/generate
 	$(BUILD)/samples/generate samples
+pollutant: $(BUILD)/samples/pollutant/pollutant
+	$< samples/layers/island.asc samples/layers/layer_1000.obj samples/layers/layer_2000.obj \
+	  --lc 870 -o $(BUILD)/pollutant $(ARGS)
 audit:
 	@sh tests/audit.sh
 stress bench: %: $(BUILD)/tests/%
@@ -70,6 +88,6 @@ stress-real: $(BUILD)/tests/stress_real
 clean:
 	rm -rf $(BUILD) $(PROGRAM)
 
-.PHONY: all demo test audit asan stress stress-real bench samples clean
+.PHONY: all demo pictures faults test audit asan stress stress-real bench samples pollutant clean
 .SECONDARY:
--include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d)
+-include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d $(BUILD)/*/*/*.d)

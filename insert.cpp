@@ -5927,9 +5927,13 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
   report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
 }
 
+/// [choice] Of l_c: a Hausdorff distance S_M - S that is warned of; and what such a way's lowest q
+/// counts when ways are compared.
+constexpr double poorHausdorff = .3, poorWorth = .6;
+
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
-  constexpr double poorHausdorff = .3, badHausdorff = .5;  // [choice] of l_c: warned of, refused
+  constexpr double badHausdorff = .5;  // [choice] of l_c: refused
   constexpr double poorShift = 2;                          // [choice] of h: warned of
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
@@ -5953,6 +5957,8 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
   try {
     insertOnWay(I, way, trial, ofThisWay);
     measureSurface(trial, I.S, ofThisWay);
+    I.progress("S_M: Hausdorff distance " + number(ofThisWay.hausdorff) + ", " +
+               number(ofThisWay.hausdorff / lc) + " l_c");
     judgeSurface(I.Q.h, ofThisWay);
   } catch (const MethodError& error) {
     I.leave(describe(way), error);
@@ -5962,7 +5968,8 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
     return;
   }
   // beside earlier surfaces the lowest q may be theirs, on every way
-  const double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
+  double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
+  if (ofThisWay.hausdorff > poorHausdorff * lc) lowest *= poorWorth;
   if (report.surface == 0 || lowest > I.lowest)
     report = ofThisWay, result = std::move(trial), I.lowest = lowest;
 }
@@ -6133,14 +6140,14 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
     if (I.ways > waysBefore || !I.isBlocked) ++tries;
     lc /= 2;
   }
-  const Nearest nearest = wasBlocked ? nearestEarlier(M, cleaned) : Nearest{"", 0};
+  const Nearest nearest = report.lc < options.lc ? nearestEarlier(M, cleaned) : Nearest{"", 0};
   if (report.surface == 0)
     throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
                       " nor down to " + number(2 * lc) + ", after " + std::to_string(I.faults) +
                       " tries, the last because " + I.reason +
-                      (wasBlocked ? "; " + nearest.text + ": lower l_c to " +
-                                        number(.5 * nearest.distance)
-                                  : "; lower l_c"));
+                      (nearest.distance < options.lc ? "; " + nearest.text + ": lower l_c to " +
+                                                           number(.5 * nearest.distance)
+                                                     : "; lower l_c"));
   std::vector<std::string> warnings = candidate.warnings;
   if (report.lc < options.lc)
     warnings.push_back("l_c was lowered from " + number(options.lc) + " to " + number(report.lc) +

@@ -8,7 +8,8 @@
 //   Polycubes        meccanos in
 //   VTK legacy       meshes out and in, with all that a later insertion needs
 //   Gmsh, MEDIT      meshes out and in, with labels and names
-//   Commands         box, terrain, solid, insert, optimize, stats, convert
+//   Pictures         the mesh behind a cut, and the histogram of its quality, as SVG
+//   Commands         box, terrain, solid, insert, optimize, stats, picture, convert
 //   Arguments        options, help, exit status: 0 done and valid, 1 an error, 2 wrong usage
 #include <unistd.h>
 
@@ -894,7 +895,8 @@ int ascCount(const AscHeader& header, const char* key, const Scanner& in) {
 
 /// The lowest coordinate of the grid points, which are the centres of the cells.
 double ascOrigin(const AscHeader& header, char axis, double cell, const Scanner& in) {
-  const std::string corner = std::string(1, axis) + "llcorner", centre = std::string(1, axis) + "llcenter";
+  const std::string corner = std::string(1, axis) + "llcorner",
+                    centre = std::string(1, axis) + "llcenter";
   if (header.value.count(corner) && header.value.count(centre))
     in.failAsWhole(corner + " and " + centre + " are both given; keep one");
   if (header.value.count(centre)) return header.of(centre.c_str(), in);
@@ -907,9 +909,10 @@ void refuseDegrees(const Terrain& T, double relief, const Scanner& in) {
   const bool geographic = std::abs(T.origin.x) <= 360 && std::abs(T.origin.y) <= 90;
   const double width = T.cell * std::max(T.nx, T.ny);
   if (geographic && T.cell < .1 && width <= 360 && relief > width)
-    in.failAsWhole("cellsize " + format("%.9g", T.cell) +
-                   " looks like degrees, and heights in metres need metres: project the grid first "
-                   "(gdalwarp -t_srs EPSG:326ZZ, ZZ the UTM zone; then gdal_translate -of AAIGrid)");
+    in.failAsWhole(
+        "cellsize " + format("%.9g", T.cell) +
+        " looks like degrees, and heights in metres need metres: project the grid first "
+        "(gdalwarp -t_srs EPSG:326ZZ, ZZ the UTM zone; then gdal_translate -of AAIGrid)");
 }
 
 /// One row of heights: from west to east.
@@ -975,16 +978,18 @@ Meccano parsePolycube(const std::string& name, const std::string& text) {
   while (lines.next()) {
     const bool corner = words[0] == "corner";
     if (!corner && words[0] != "cube")
-      lines.in.failHere("'" + std::string(words[0].substr(0, 40)) +
-                     "' is no line of a polycube; they are `cube i j k` and `corner i j k  x y z`");
+      lines.in.failHere(
+          "'" + std::string(words[0].substr(0, 40)) +
+          "' is no line of a polycube; they are `cube i j k` and `corner i j k  x y z`");
     if (words.size() != (corner ? 7u : 4u))
-      lines.in.failHere(std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
-                     ", here are " + std::to_string(words.size() - 1) + " numbers");
+      lines.in.failHere(
+          std::string(corner ? "a corner is `corner i j k  x y z`" : "a cube is `cube i j k`") +
+          ", here are " + std::to_string(words.size() - 1) + " numbers");
     std::array<int, 3> at;
     for (int i = 0; i < 3; ++i)
       if (!parse(words[i + 1], at[i]) || std::abs(at[i]) > farthest)
         lines.in.failHere("'" + std::string(words[i + 1].substr(0, 40)) +
-                       "' is no integer of the lattice; correct it");
+                          "' is no integer of the lattice; correct it");
     if (!corner) {
       if (std::find(D.cubes.begin(), D.cubes.end(), at) != D.cubes.end())
         lines.in.failHere("this cube is given twice; keep one line");
@@ -995,7 +1000,7 @@ Meccano parsePolycube(const std::string& name, const std::string& text) {
     for (int i = 0; i < 3; ++i)
       if (!parse(words[i + 4], x[i]) || !std::isfinite(x[i]))
         lines.in.failHere("'" + std::string(words[i + 4].substr(0, 40)) +
-                       "' is no coordinate; correct it");
+                          "' is no coordinate; correct it");
     D.corners.push_back({at, {x[0], x[1], x[2]}});
   }
   if (D.cubes.empty()) lines.in.failAsWhole("no `cube i j k` line in it; is it a polycube?");
@@ -1397,10 +1402,40 @@ std::string vtkText(const Mesh& M) {
 
 // ==== Meshes without a meccano: faces by their groups ===========================================
 
-/// A triangle of a mesh file with the number of its group, > 0.
+/// A triangle of a mesh file with the number of its group or its label.
 struct TaggedFace {
   std::array<int, 3> nodes;
   int tag;
+  int uses = 0;  // as a face of a tetrahedron
+};
+
+/// The triangles of a file by their nodes, to be found again among the faces of its tetrahedra.
+class FaceIndex {
+ public:
+  std::vector<TaggedFace> faces;  // nodes ascending, in their order
+
+  FaceIndex(const std::vector<TaggedFace>& list, std::size_t nodes) : faces(list), used_(nodes) {
+    for (TaggedFace& f : faces) {
+      for (int n : f.nodes) used_[n] = 1;
+      std::sort(f.nodes.begin(), f.nodes.end());
+    }
+    std::stable_sort(faces.begin(), faces.end(), less);
+  }
+  /// Face i of the tetrahedron z, one use more of it; nullptr where the file has no such triangle.
+  const TaggedFace* use(const std::array<int, 4>& z, int i) {
+    TaggedFace key{{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]}, 0};
+    for (int n : key.nodes)
+      if (!used_[n]) return nullptr;
+    std::sort(key.nodes.begin(), key.nodes.end());
+    const auto at = std::lower_bound(faces.begin(), faces.end(), key, less);
+    if (at == faces.end() || at->nodes != key.nodes) return nullptr;
+    ++at->uses;
+    return &*at;
+  }
+
+ private:
+  static bool less(const TaggedFace& a, const TaggedFace& b) { return a.nodes < b.nodes; }
+  std::vector<char> used_;  // [nodes]
 };
 
 /// A mesh as a file has it. Only .vtk files of meccano fill more than M's x, tets and faceLabel,
@@ -1413,32 +1448,20 @@ struct MeshFile {
 
 /// Labels the faces that the file's triangles name: groups inside the mesh become surfaces 1, 2,
 /// ..., groups on its boundary patches 1, 2, ..., both in the order of their numbers.
-void labelByTags(MeshFile& file, std::vector<TaggedFace> faces,
+void labelByTags(MeshFile& file, const std::vector<TaggedFace>& faces,
                  const std::map<int, std::string>& names = {}) {
   if (faces.empty()) return;
   Mesh& M = file.M;
-  std::vector<char> used(M.x.size(), 0);
-  for (TaggedFace& f : faces) {
-    for (int n : f.nodes) used[n] = 1;
-    std::sort(f.nodes.begin(), f.nodes.end());
-  }
-  const auto less = [](const TaggedFace& a, const TaggedFace& b) { return a.nodes < b.nodes; };
-  std::stable_sort(faces.begin(), faces.end(), less);
-  std::vector<char> found(faces.size(), 0);
+  FaceIndex index(faces, M.x.size());
   const std::vector<std::array<int, 4>> neighbour = faceNeighbours(M);
   M.faceLabel.assign(M.tets.size(), {0, 0, 0, 0});
   std::map<int, int> surfaces, patches;  // tag -> number
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int i = 0; i < 4; ++i) {
-      const std::array<int, 4>& z = M.tets[E];
-      TaggedFace key{{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]}, 0};
-      if (!used[key.nodes[0]] || !used[key.nodes[1]] || !used[key.nodes[2]]) continue;
-      std::sort(key.nodes.begin(), key.nodes.end());
-      const auto at = std::lower_bound(faces.begin(), faces.end(), key, less);
-      if (at == faces.end() || at->nodes != key.nodes) continue;
-      found[at - faces.begin()] = 1;
-      M.faceLabel[E][i] = neighbour[E][i] < 0 ? -at->tag : at->tag;
-      (neighbour[E][i] < 0 ? patches : surfaces)[at->tag] = 0;
+      const TaggedFace* f = index.use(M.tets[E], i);
+      if (!f) continue;
+      M.faceLabel[E][i] = neighbour[E][i] < 0 ? -f->tag : f->tag;
+      (neighbour[E][i] < 0 ? patches : surfaces)[f->tag] = 0;
     }
   const auto number = [&](std::map<int, int>& tags, std::vector<Parametrization>& list,
                           const char* word) {
@@ -1454,7 +1477,8 @@ void labelByTags(MeshFile& file, std::vector<TaggedFace> faces,
     for (int& label : labels)
       label = label < 0 ? -patches[-label] : label > 0 ? surfaces[label] : 0;
   if (surfaces.empty() && patches.empty()) M.faceLabel.clear();
-  const auto strays = std::count(found.begin(), found.end(), 0);
+  const auto strays = std::count_if(index.faces.begin(), index.faces.end(),
+                                    [](const TaggedFace& f) { return f.uses == 0; });
   if (strays > 0)
     file.warnings.push_back(std::to_string(strays) +
                             " triangles are no faces of its tetrahedra, or there twice: left out");
@@ -1688,40 +1712,33 @@ void orderForBisection(Mesh& M, const Scanner& in) {
   }
 }
 
+bool isTriangle(const VtkFile& file, std::size_t c) {
+  constexpr int triangle = 5;
+  return file.types[c] == triangle && file.start[c + 1] - file.start[c] == 3;
+}
+
+/// The nodes of a triangle.
+std::array<int, 3> cornersOf(const VtkFile& file, std::size_t c) {
+  const int first = file.start[c];
+  return {file.nodes[first], file.nodes[first + 1], file.nodes[first + 2]};
+}
+
 /// Finds the file's triangles among the faces, and refuses a boundary without its patches.
 void labelFaces(const VtkFile& file, Mesh& M, const Scanner& in) {
-  constexpr int triangle = 5;
-  using Key = std::array<int, 3>;
-  struct Labelled {
-    Key key;
-    int label, uses;
-  };
-  std::vector<Labelled> faces;
+  std::vector<TaggedFace> triangles;
   Unpacking surface(file.cellData, "surface", 1, in);
-  std::vector<char> used(M.x.size(), 0);
   for (std::size_t c = 0; c < file.types.size(); ++c) {
     const int label = surface.integer(-static_cast<int>(M.patches.size()), INT_MAX);
-    if (file.types[c] != triangle || file.start[c + 1] - file.start[c] != 3) continue;
-    const int* n = &file.nodes[file.start[c]];
-    faces.push_back({{n[0], n[1], n[2]}, label, 0});
-    std::sort(faces.back().key.begin(), faces.back().key.end());
-    for (int i = 0; i < 3; ++i) used[n[i]] = 1;
+    if (isTriangle(file, c)) triangles.push_back({cornersOf(file, c), label});
   }
-  auto less = [](const Labelled& a, const Labelled& b) { return a.key < b.key; };
-  std::sort(faces.begin(), faces.end(), less);
+  FaceIndex index(triangles, M.x.size());
   const std::vector<std::array<int, 4>> neighbour = faceNeighbours(M);
   M.faceLabel.assign(M.tets.size(), {0, 0, 0, 0});
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int i = 0; i < 4; ++i) {
-      const std::array<int, 4>& z = M.tets[E];
-      Key key{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
+      const TaggedFace* f = index.use(M.tets[E], i);
+      const int label = f ? f->tag : 0;
       const bool boundary = neighbour[E][i] < 0;
-      int label = 0;
-      if (used[key[0]] && used[key[1]] && used[key[2]]) {
-        std::sort(key.begin(), key.end());
-        const auto at = std::lower_bound(faces.begin(), faces.end(), Labelled{key, 0, 0}, less);
-        if (at != faces.end() && at->key == key) label = at->label, ++at->uses;
-      }
       if (boundary != (label < 0))
         in.failAsWhole("face " + std::to_string(i) + " of tetrahedron " + std::to_string(E) +
                        (boundary ? " lies on the boundary, and no patch is named for it"
@@ -1729,10 +1746,10 @@ void labelFaces(const VtkFile& file, Mesh& M, const Scanner& in) {
                        "; use the file as meccano wrote it");
       M.faceLabel[E][i] = label;
     }
-  for (const Labelled& f : faces)  // one that is there twice has no use the second time
-    if (f.uses != (f.label > 0 ? 2 : 1))
-      in.failAsWhole("the triangle of nodes " + std::to_string(f.key[0]) + " " +
-                     std::to_string(f.key[1]) + " " + std::to_string(f.key[2]) +
+  for (const TaggedFace& f : index.faces)  // one that is there twice has no use the second time
+    if (f.uses != (f.tag > 0 ? 2 : 1))
+      in.failAsWhole("the triangle of nodes " + std::to_string(f.nodes[0]) + " " +
+                     std::to_string(f.nodes[1]) + " " + std::to_string(f.nodes[2]) +
                      " is no face of the mesh, or there twice; use the file as meccano wrote it");
 }
 
@@ -1757,17 +1774,15 @@ void readNodes(const VtkFile& file, Mesh& M, const Scanner& in) {
 
 /// The triangles of a file without a meccano by its array `surface`, where that is one of labels.
 void labelPlain(const VtkFile& file, Mesh& M) {
-  constexpr int triangle = 5;
   const auto found = file.cellData.find("surface");
-  if (found == file.cellData.end() || found->second.components != 1) return;
+  if (found == file.cellData.end() || found->second.values.size() != file.types.size()) return;
   MeshFile labelled;
   std::vector<TaggedFace> faces;
   for (std::size_t c = 0; c < file.types.size(); ++c) {
     const double label = std::abs(found->second.values[c]);
     const bool good = label >= 1 && label < INT_MAX && label == std::floor(label);
-    const int* n = &file.nodes[file.start[c]];
-    if (good && file.types[c] == triangle && file.start[c + 1] - file.start[c] == 3)
-      faces.push_back({{n[0], n[1], n[2]}, static_cast<int>(label)});
+    if (good && isTriangle(file, c))
+      faces.push_back({cornersOf(file, c), static_cast<int>(label)});
   }
   std::swap(labelled.M, M);
   labelByTags(labelled, faces);
@@ -2200,6 +2215,12 @@ std::string listText(const std::string& head, const TriangleSurface& S) {
   return out.take();
 }
 
+/// The nearest float. Volatile: g++ 12 -O2 drops the rounding of double(float(v)) in pairs.
+float nearestFloat(double v) {
+  volatile float f = static_cast<float>(v);
+  return f;
+}
+
 void putLittleEndian(std::string& text, std::uint32_t value, int bytes) {
   for (int i = 0; i < bytes; ++i) text += static_cast<char>(value >> 8 * i & 255);
 }
@@ -2214,7 +2235,7 @@ std::string stlText(const TriangleSurface& S) {
     const double length = norm(normal);
     for (Vec3 x : {length > 0 ? (1 / length) * normal : Vec3{}, a, b, c})
       for (double v : {x.x, x.y, x.z}) {
-        const float f = static_cast<float>(v);
+        const float f = nearestFloat(v);
         std::uint32_t bits = 0;
         std::memcpy(&bits, &f, 4);
         putLittleEndian(text, bits, 4);
@@ -2244,7 +2265,7 @@ std::string surfaceText(const std::string& path, const std::vector<TriangleSurfa
                     S);
   double change = 0;
   for (Vec3 x : S.points)
-    for (double v : {x.x, x.y, x.z}) change = std::max(change, std::abs(v - double(float(v))));
+    for (double v : {x.x, x.y, x.z}) change = std::max(change, std::abs(v - nearestFloat(v)));
   if (!std::isfinite(change)) fail(path + ": a coordinate is too large for STL; write .obj or .ts");
   if (change > 0)
     warnings.push_back(path + ": STL has single precision, coordinates change by up to " +
@@ -2274,6 +2295,830 @@ std::vector<TriangleSurface> insertedSurfaces(const std::string& path, const Mes
   }
   if (all.empty()) fail(path + ": no surface is inserted in this mesh; write it as a mesh");
   return all;
+}
+
+// ==== Pictures ==================================================================================
+// The tetrahedra behind a cut plane, whole, as Figures 8 and 11 show them: the faces between what
+// is shown and what is left out, in parallel projection, coloured, shaded by their normals, as SVG.
+// An item buffer tells which faces are seen; those are painted from back to front.
+
+enum class Colour { quality, level, surface };
+
+/// The plane x, y or z (axis 0, 1, 2) = value.
+struct Cut {
+  int axis = 1;
+  double value = 0;
+};
+
+struct Segment {
+  Vec3 a, b;
+};
+
+struct PictureOptions {
+  Cut cut;
+  Colour colour = Colour::quality;
+  std::string title;
+  std::vector<Segment> line = {};  // drawn in bold over the mesh: where a surface will come
+};
+
+using Triangle3 = std::array<Vec3, 3>;
+
+struct Box {
+  Vec3 low, high;
+  void add(Vec3 x) {
+    low = {std::min(low.x, x.x), std::min(low.y, x.y), std::min(low.z, x.z)};
+    high = {std::max(high.x, x.x), std::max(high.y, x.y), std::max(high.z, x.z)};
+  }
+};
+
+Box boxOf(const std::vector<Vec3>& points) {
+  Box box{points.front(), points.front()};
+  for (Vec3 x : points) box.add(x);
+  return box;
+}
+
+constexpr const char* axisNames = "xyz";
+
+double component(Vec3 x, int axis) { return axis == 0 ? x.x : axis == 1 ? x.y : x.z; }
+
+std::string nameOf(const Cut& cut) {
+  return std::string(1, axisNames[cut.axis]) + " = " + format("%.6g", cut.value);
+}
+
+/// The eye is before the plane, where x is high, y low, z high; shown is what is behind.
+bool isBehind(const Cut& cut, Vec3 x) {
+  return (component(x, cut.axis) - cut.value) * (cut.axis == 1 ? 1 : -1) >= 0;
+}
+
+/// Quarters of the undeformed cubes, as long as they stay within the box: there the cut is flat.
+void snapToCubes(Cut& cut, const Mesh& M, const Box& within) {
+  const double quarter = .25 * component(M.cube, cut.axis),
+               low = component(boxOf(M.x).low, cut.axis);
+  const double snapped = low + quarter * std::round((cut.value - low) / quarter);
+  if (!M.xi.empty() && snapped > component(within.low, cut.axis) &&
+      snapped < component(within.high, cut.axis))
+    cut.value = snapped;
+}
+
+/// Through the middle of the triangles, normal to the axis y, x or z (the first of equals) that is
+/// most nearly tangential to them, so that the cut shows them as a line; without any through the
+/// middle of the mesh, normal to y.
+Cut defaultCut(const std::vector<Triangle3>& triangles, const Mesh& M) {
+  constexpr double equal = 1e-9;  // relative: rounding of the sums
+  const Box mesh = boxOf(M.x);
+  Cut cut{1, .5 * (mesh.low.y + mesh.high.y)};
+  if (triangles.empty()) return cut;
+  Box box{triangles[0][0], triangles[0][0]};
+  std::array<double, 3> across{0, 0, 0};  // sum of areas seen along the axis
+  for (const Triangle3& t : triangles) {
+    for (Vec3 x : t) box.add(x);
+    const Vec3 n = cross(t[1] - t[0], t[2] - t[0]);
+    for (int i = 0; i < 3; ++i) across[i] += std::abs(component(n, i));
+  }
+  const double sum = across[0] + across[1] + across[2];
+  for (int i : {0, 2})
+    if (across[i] < across[cut.axis] - equal * sum) cut.axis = i;
+  cut.value = .5 * (component(box.low, cut.axis) + component(box.high, cut.axis));
+  snapToCubes(cut, M, box);
+  const double low = component(mesh.low, cut.axis), high = component(mesh.high, cut.axis);
+  if (!(cut.value > low && cut.value < high)) cut.value = .5 * (low + high);
+  return cut;
+}
+
+std::vector<Triangle3> trianglesOf(const TriangleSurface& S) {
+  std::vector<Triangle3> all;
+  for (const std::array<int, 3>& t : S.triangles)
+    all.push_back({S.points[t[0]], S.points[t[1]], S.points[t[2]]});
+  return all;
+}
+
+/// The faces of all inserted surfaces.
+std::vector<Triangle3> insertedTriangles(const Mesh& M) {
+  std::vector<Triangle3> all;
+  for (std::size_t E = 0; E < M.faceLabel.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      if (M.faceLabel[E][i] <= 0) continue;
+      const std::array<int, 4>& z = M.tets[E];
+      all.push_back({M.x[z[(i + 1) % 4]], M.x[z[(i + 2) % 4]], M.x[z[(i + 3) % 4]]});
+    }
+  return all;
+}
+
+/// Where the triangles cross the plane.
+std::vector<Segment> sectionOf(const std::vector<Triangle3>& triangles, const Cut& cut) {
+  std::vector<Segment> line;
+  for (const Triangle3& t : triangles) {
+    std::vector<Vec3> ends;
+    for (int i = 0; i < 3; ++i) {
+      const Vec3 a = t[i], b = t[(i + 1) % 3];
+      if (isBehind(cut, a) == isBehind(cut, b)) continue;
+      const double from = component(a, cut.axis), to = component(b, cut.axis);
+      ends.push_back(a + (cut.value - from) / (to - from) * (b - a));
+    }
+    if (ends.size() == 2) line.push_back({ends[0], ends[1]});
+  }
+  return line;
+}
+
+// ---- the faces
+
+/// A face of a tetrahedron that is shown.
+struct Facet {
+  std::array<int, 3> nodes;
+  int tet;
+  int label;  // as Mesh::faceLabel, 0 where the mesh has no labels
+  bool boundary;
+  int colour = 0, tone = 0;  // entry of the legend; shade, 0 the darkest
+};
+
+/// The faces between tetrahedra behind the cut and the rest; with `sheets` also all faces of
+/// inserted surfaces before it.
+std::vector<Facet> facetsBehind(const Mesh& M, const Cut& cut, bool sheets, int& shown) {
+  std::vector<char> behind(M.tets.size());
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    Vec3 sum;
+    for (int n : M.tets[E]) sum += M.x[n];
+    behind[E] = isBehind(cut, .25 * sum);
+  }
+  shown = static_cast<int>(std::count(behind.begin(), behind.end(), 1));
+  const std::vector<std::array<int, 4>> neighbour = faceNeighbours(M);
+  std::vector<Facet> facets;
+  for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
+    for (int i = 0; i < 4; ++i) {
+      const int other = neighbour[E][i], label = M.faceLabel.empty() ? 0 : M.faceLabel[E][i];
+      const bool otherBehind = other >= 0 && behind[other];
+      const bool sheet = sheets && label > 0 && !behind[E] && !otherBehind && other < E;
+      if (!sheet && (!behind[E] || otherBehind)) continue;
+      const std::array<int, 4>& z = M.tets[E];
+      facets.push_back(
+          {{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]}, E, label, other < 0 && label <= 0});
+    }
+  return facets;
+}
+
+// ---- colours
+
+struct Rgb {
+  double r, g, b;
+};
+
+std::string hex(Rgb c, double light = 1) {
+  auto byte = [&](double v) { return std::clamp(static_cast<int>(light * v + .5), 0, 255); };
+  return format("#%02x%02x%02x", byte(c.r), byte(c.g), byte(c.b));
+}
+
+/// From dark blue (0) to pale yellow (1), after ColorBrewer's YlGnBu: even steps in lightness, safe
+/// for colour-blind readers.
+Rgb rampColour(double t) {
+  constexpr Rgb stops[] = {
+      {8, 29, 88}, {36, 70, 156}, {29, 145, 192}, {127, 205, 187}, {255, 255, 217}};
+  const double at = 4 * std::clamp(t, 0., 1.);
+  const int i = std::min(3, static_cast<int>(at));
+  const Rgb a = stops[i], b = stops[i + 1];
+  const double w = at - i;
+  return {a.r + w * (b.r - a.r), a.g + w * (b.g - a.g), a.b + w * (b.b - a.b)};
+}
+
+/// Okabe and Ito's colours, told apart by colour-blind readers; from the eighth on again.
+Rgb sheetColour(int k) {
+  constexpr Rgb colours[] = {{213, 94, 0},  {0, 114, 178},  {0, 158, 115}, {204, 121, 167},
+                             {230, 159, 0}, {86, 180, 233}, {240, 228, 66}};
+  return colours[(k - 1) % 7];
+}
+
+constexpr Rgb sheetFill{244, 165, 100}, sheetLine{190, 60, 0};  // where all have one colour
+constexpr Rgb invertedFill{208, 28, 139};
+constexpr int qualityClasses = 20;  // as in QualityStatistics::histogram
+
+/// What the colours mean.
+struct Legend {
+  struct Entry {
+    Rgb colour;
+    std::string text;
+  };
+  std::string title;
+  std::vector<Entry> entries;
+  int bar = 0;  // so many entries first are the classes of q, drawn as a colour bar
+};
+
+int inserted(const Mesh& M) {
+  int highest = 0;
+  for (const std::array<int, 4>& labels : M.faceLabel)
+    for (int label : labels) highest = std::max(highest, label);
+  return highest;
+}
+
+int qualityClass(double q) {
+  return std::clamp(static_cast<int>(q * qualityClasses), 0, qualityClasses - 1);
+}
+
+Rgb qualityColour(int c) { return rampColour((c + .5) / qualityClasses); }
+
+Legend colourByQuality(const Mesh& M, std::vector<Facet>& facets, bool line) {
+  Legend legend{"quality q", {}, qualityClasses};
+  for (int c = 0; c < qualityClasses; ++c) legend.entries.push_back({qualityColour(c), ""});
+  legend.entries.push_back({invertedFill, "inverted"});
+  if (line || inserted(M) > 0) legend.entries.push_back({sheetFill, "inserted surface"});
+  const std::vector<double> q = qualities(M);
+  for (Facet& f : facets)
+    f.colour = f.label > 0     ? qualityClasses + 1
+               : q[f.tet] <= 0 ? qualityClasses
+                               : qualityClass(q[f.tet]);
+  return legend;
+}
+
+Legend colourByLevel(const Mesh& M, std::vector<Facet>& facets, bool line) {
+  if (M.level.empty())
+    fail(
+        "picture: the mesh has no levels of bisection; only a .vtk file of meccano has, use "
+        "--colour quality");
+  const auto [low, high] = std::minmax_element(M.level.begin(), M.level.end());
+  const int lowest = *low, levels = *high - lowest + 1;
+  std::vector<int> count(levels, 0);
+  for (int level : M.level) ++count[level - lowest];
+  Legend legend{"level (tetrahedra)", {}, 0};
+  for (int l = 0; l < levels; ++l)
+    legend.entries.push_back(
+        {rampColour(1 - (l + .5) / levels), format("%d (%d)", lowest + l, count[l])});
+  if (line || inserted(M) > 0) legend.entries.push_back({sheetFill, "inserted surface"});
+  for (Facet& f : facets) f.colour = f.label > 0 ? levels : M.level[f.tet] - lowest;
+  return legend;
+}
+
+Legend colourBySurface(const Mesh& M, std::vector<Facet>& facets) {
+  const int count = inserted(M);
+  if (count == 0)
+    fail("picture: no surface is inserted in the mesh; use --colour quality or --colour level");
+  Legend legend{"surface", {{{250, 250, 246}, "cut"}, {{214, 224, 234}, "boundary"}}, 0};
+  for (int k = 1; k <= count; ++k) {
+    const bool named = k <= static_cast<int>(M.surfaces.size());
+    legend.entries.push_back(
+        {sheetColour(k), format("%d ", k) + (named ? M.surfaces[k - 1].name : std::string())});
+  }
+  for (Facet& f : facets) f.colour = f.label > 0 ? f.label + 1 : f.boundary ? 1 : 0;
+  return legend;
+}
+
+Legend colourFacets(const Mesh& M, const PictureOptions& o, std::vector<Facet>& facets) {
+  const bool line = !o.line.empty();
+  if (o.colour == Colour::surface) return colourBySurface(M, facets);
+  if (o.colour == Colour::level) return colourByLevel(M, facets, line);
+  return colourByQuality(M, facets, line);
+}
+
+// ---- projection and visibility
+
+/// Parallel projection: pixels to the right, pixels downwards, depth away from the eye.
+struct View {
+  Vec3 origin, right, down, away;
+  Vec3 operator()(Vec3 x) const {
+    const Vec3 d = x - origin;
+    return {dot(right, d), dot(down, d), dot(away, d)};
+  }
+};
+
+constexpr double drawnWidth = 560, drawnHeight = 500;  // pixels, at most, of what is behind the cut
+
+/// The eye before the cut, a little aside and above; z is upwards.
+View viewOf(const Cut& cut) {
+  constexpr Vec3 towardsEye[3] = {{1, .4, .45}, {.4, -1, .45}, {.32, -.6, 1}};
+  const Vec3 away = (-1 / norm(towardsEye[cut.axis])) * towardsEye[cut.axis];
+  Vec3 right = cross(away, {0, 0, 1});
+  right = (1 / norm(right)) * right;
+  return {{0, 0, 0}, right, cross(away, right), away};
+}
+
+/// The part of the box behind the cut, as it is seen.
+Box seenBox(const View& view, Box box, const Cut& cut) {
+  (cut.axis == 0 ? box.high.x : cut.axis == 1 ? box.low.y : box.high.z) = cut.value;
+  const Vec3 first = view(box.low);
+  Box seen{first, first};
+  for (int i = 1; i < 8; ++i)
+    seen.add(view({i & 1 ? box.high.x : box.low.x, i & 2 ? box.high.y : box.low.y,
+                   i & 4 ? box.high.z : box.low.z}));
+  return seen;
+}
+
+View scaledView(const Cut& cut, const Box& box) {
+  View view = viewOf(cut);
+  view.origin = box.low;
+  const Box seen = seenBox(view, box, cut);
+  const Vec3 size = seen.high - seen.low;
+  const double scale = std::min(drawnWidth / size.x, drawnHeight / size.y);
+  for (Vec3* v : {&view.right, &view.down, &view.away}) *v = scale * *v;
+  return view;
+}
+
+/// Light from the upper left behind the eye; the tones are few, so that faces can share them.
+constexpr int tones = 6;
+constexpr double darkest = .74;
+
+double lightOf(int tone) { return darkest + (1 - darkest) * tone / (tones - 1); }
+
+int toneOf(const Triangle3& seen) {
+  constexpr Vec3 light{-.22, -.38, -.9};  // to the right, down, away
+  const Vec3 n = cross(seen[1] - seen[0], seen[2] - seen[0]);
+  const double length = norm(n);
+  if (length == 0) return tones - 1;
+  return std::min(tones - 1, static_cast<int>(tones * std::abs(dot(n, light)) / length));
+}
+
+/// Calls at(sample, depth) for the samples (pixel centres) inside a triangle.
+template <class At>
+void forEachSample(const Triangle3& p, int width, int height, At at) {
+  const Vec2 a{p[0].x, p[0].y}, b{p[1].x, p[1].y}, c{p[2].x, p[2].y};
+  const double area = cross(b - a, c - a);
+  if (area == 0) return;
+  auto bounds = [](double u, double v, double w, int size) {
+    return std::pair<int, int>{std::max(0, static_cast<int>(std::min({u, v, w}) - .5)),
+                               std::min(size - 1, static_cast<int>(std::max({u, v, w}) + .5))};
+  };
+  const auto [x0, x1] = bounds(a.x, b.x, c.x, width);
+  const auto [y0, y1] = bounds(a.y, b.y, c.y, height);
+  for (int y = y0; y <= y1; ++y)
+    for (int x = x0; x <= x1; ++x) {
+      const Vec2 s{x + .5, y + .5};
+      const double u = cross(b - s, c - s) / area, v = cross(c - s, a - s) / area, w = 1 - u - v;
+      if (u >= 0 && v >= 0 && w >= 0) at(y * width + x, u * p[0].z + v * p[1].z + w * p[2].z);
+    }
+}
+
+/// The nearest facet at each sample, -1 none.
+struct ItemBuffer {
+  int width, height;
+  std::vector<int> item;
+};
+
+ItemBuffer itemBuffer(const std::vector<Triangle3>& seen, int width, int height) {
+  ItemBuffer B{width, height, std::vector<int>(std::size_t(width) * height, -1)};
+  std::vector<double> depth(B.item.size(), 0);
+  for (std::size_t f = 0; f < seen.size(); ++f)
+    forEachSample(seen[f], width, height, [&](int s, double d) {
+      if (B.item[s] >= 0 && depth[s] <= d) return;
+      B.item[s] = static_cast<int>(f);
+      depth[s] = d;
+    });
+  return B;
+}
+
+/// Facets in layers, to be painted one after the other: where two overlap at a sample, the one seen
+/// there is in a later layer. -1: seen nowhere. Cycles are cut at the facet farthest away.
+std::vector<int> paintingLayers(const std::vector<Triangle3>& seen, const ItemBuffer& B) {
+  const int n = static_cast<int>(seen.size());
+  std::vector<int> layer(n, -1);
+  for (int f : B.item)
+    if (f >= 0) layer[f] = 0;
+  std::vector<std::pair<int, int>> before;  // first is to be painted before second
+  for (int f = 0; f < n; ++f)
+    if (layer[f] == 0)
+      forEachSample(seen[f], B.width, B.height, [&](int s, double) {
+        if (B.item[s] != f) before.push_back({f, B.item[s]});
+      });
+  std::sort(before.begin(), before.end());
+  before.erase(std::unique(before.begin(), before.end()), before.end());
+  std::vector<int> waits(n, 0), byDepth, ready;
+  for (const auto& [first, second] : before) ++waits[second];
+  for (int f = 0; f < n; ++f)
+    if (layer[f] == 0) byDepth.push_back(f);
+  auto depth = [&](int f) { return seen[f][0].z + seen[f][1].z + seen[f][2].z; };
+  std::stable_sort(byDepth.begin(), byDepth.end(),
+                   [&](int f, int g) { return depth(f) > depth(g); });
+  std::vector<char> done(n, 0);
+  auto finish = [&](int f) {
+    done[f] = 1;
+    for (auto p = std::lower_bound(before.begin(), before.end(), std::pair<int, int>{f, -1});
+         p != before.end() && p->first == f; ++p) {
+      layer[p->second] = std::max(layer[p->second], layer[f] + 1);
+      if (--waits[p->second] == 0) ready.push_back(p->second);
+    }
+  };
+  for (int start : byDepth)
+    if (waits[start] == 0) ready.push_back(start);
+  for (std::size_t next = 0, forced = 0; next < ready.size() || forced < byDepth.size();) {
+    const int f = next < ready.size() ? ready[next++] : byDepth[forced++];
+    if (!done[f]) finish(f);
+  }
+  return layer;
+}
+
+// ---- SVG
+
+std::string escaped(const std::string& text, std::size_t most) {
+  std::string out;
+  for (char c : text.substr(0, most)) {
+    if (c == '&')
+      out += "&amp;";
+    else if (c == '<')
+      out += "&lt;";
+    else if (c == '>')
+      out += "&gt;";
+    else if (c == '"')
+      out += "&quot;";
+    else
+      out += static_cast<unsigned char>(c) < 32 || static_cast<unsigned char>(c) > 126 ? '?' : c;
+  }
+  return text.size() > most ? out + "..." : out;
+}
+
+int tenths(double pixels) { return static_cast<int>(std::lround(10 * pixels)); }
+
+/// "a b", or "a-b": as short as a path may be.
+void putPair(Text& out, int a, int b) {
+  out << a;
+  if (b >= 0) out << " ";
+  out << b;
+}
+
+void putTriangle(Text& out, const Triangle3& t) {
+  std::array<int, 6> p;
+  for (int i = 0; i < 3; ++i) {
+    p[2 * i] = tenths(t[i].x);
+    p[2 * i + 1] = tenths(t[i].y);
+  }
+  out << "M";
+  putPair(out, p[0], p[1]);
+  out << "l";
+  putPair(out, p[2] - p[0], p[3] - p[1]);
+  if (p[4] >= p[2]) out << " ";
+  putPair(out, p[4] - p[2], p[5] - p[3]);
+  out << "z";
+}
+
+void putSegment(Text& out, Vec3 a, Vec3 b) {
+  out << "M";
+  putPair(out, tenths(a.x), tenths(a.y));
+  out << "L";
+  putPair(out, tenths(b.x), tenths(b.y));
+}
+
+void putText(Text& out, double x, double y, const std::string& text, const char* more = "") {
+  out << format("<text x=\"%.1f\" y=\"%.1f\"%s>", x, y, more) << text << "</text>\n";
+}
+
+void putRectangle(Text& out, double x, double y, double w, double h, const std::string& fill,
+                  const char* more = "") {
+  out << format("<rect x=\"%.1f\" y=\"%.1f\" width=\"%.1f\" height=\"%.1f\" fill=\"%s\"%s/>\n", x,
+                y, w, h, fill.c_str(), more);
+}
+
+void putPage(Text& out, double width, double height, const std::string& title) {
+  out << format(
+      "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"%.0f\" height=\"%.0f\" viewBox=\"0 0 %.0f "
+      "%.0f\" font-family=\"Helvetica,Arial,sans-serif\" font-size=\"13\" fill=\"#222\">\n",
+      width, height, width, height);
+  out << "<title>" << title << "</title>\n";
+  putRectangle(out, 0, 0, width, height, "#fff");
+}
+
+/// A bold edge: of an inserted surface where the picture shows its side, or its rim.
+struct BoldEdge {
+  int a, b, label, layer;
+};
+
+std::vector<BoldEdge> boldEdges(const Mesh& M, const std::vector<Facet>& facets,
+                                const std::vector<int>& layer) {
+  std::map<std::pair<int, int>, int> onSheet;  // edge, label
+  for (std::size_t E = 0; E < M.faceLabel.size(); ++E)
+    for (int i = 0; i < 4; ++i)
+      for (int j = 1; M.faceLabel[E][i] > 0 && j < 4; ++j) {
+        const int a = M.tets[E][(i + j) % 4], b = M.tets[E][(i + j % 3 + 1) % 4];
+        onSheet[std::minmax(a, b)] = M.faceLabel[E][i];
+      }
+  struct Seen {
+    int sheets = 0, others = 0, layer = -1;
+  };
+  std::map<std::pair<int, int>, Seen> seen;
+  for (std::size_t f = 0; f < facets.size(); ++f)
+    for (int i = 0; i < 3; ++i) {
+      const std::pair<int, int> edge =
+          std::minmax(facets[f].nodes[i], facets[f].nodes[(i + 1) % 3]);
+      if (!onSheet.count(edge)) continue;
+      Seen& s = seen[edge];
+      ++(facets[f].label > 0 ? s.sheets : s.others);
+      s.layer = std::max(s.layer, layer[f]);
+    }
+  std::vector<BoldEdge> edges;
+  for (const auto& [edge, s] : seen)
+    if (s.layer >= 0 && (s.others > 0 || s.sheets == 1))
+      edges.push_back({edge.first, edge.second, onSheet[edge], s.layer});
+  return edges;
+}
+
+/// What is drawn of a mesh, in pixels.
+struct Drawing {
+  std::vector<Facet> facets;
+  std::vector<Triangle3> seen;  // [facets]
+  std::vector<Vec3> nodes;      // as seen
+  double width = 0, height = 0;
+  Vec3 corner;             // of the frame in the view: what nodes and seen are relative to
+  std::vector<int> layer;  // [facets], -1: not seen
+  std::vector<BoldEdge> bold;
+  Legend legend;
+  int shown = 0, visible = 0;  // tetrahedra, facets
+  std::string reduced;         // what was left out; "" nothing
+};
+
+/// Pixels right and down from the upper left corner of all that is drawn.
+void place(Drawing& D, const Mesh& M, const Cut& cut) {
+  const Box box = boxOf(M.x);
+  const View view = scaledView(cut, box);
+  Box frame = seenBox(view, box, cut);
+  for (Vec3 x : M.x) D.nodes.push_back(view(x));
+  for (const Facet& f : D.facets)
+    for (int n : f.nodes) frame.add(D.nodes[n]);
+  for (Vec3& p : D.nodes) p = p - frame.low;
+  for (Facet& f : D.facets) {
+    D.seen.push_back({D.nodes[f.nodes[0]], D.nodes[f.nodes[1]], D.nodes[f.nodes[2]]});
+    f.tone = toneOf(D.seen.back());
+  }
+  D.corner = frame.low;
+  D.width = frame.high.x - frame.low.x;
+  D.height = frame.high.y - frame.low.y;
+}
+
+/// Facets that share layer, colour and tone share a path.
+std::map<std::array<int, 3>, std::vector<int>> pathsOf(const Drawing& D) {
+  std::map<std::array<int, 3>, std::vector<int>> paths;
+  for (std::size_t f = 0; f < D.facets.size(); ++f)
+    if (D.layer[f] >= 0)
+      paths[{D.layer[f], D.facets[f].colour, D.facets[f].tone}].push_back(static_cast<int>(f));
+  return paths;
+}
+
+Rgb lineColour(const Drawing& D, Colour colour, int label) {
+  if (colour != Colour::surface) return sheetLine;
+  const Rgb c = D.legend.entries[label + 1].colour;
+  return {.55 * c.r, .55 * c.g, .55 * c.b};
+}
+
+void putBoldEdges(Text& out, const Drawing& D, Colour colour, int layer) {
+  std::map<int, std::vector<BoldEdge>> ofLabel;
+  for (const BoldEdge& e : D.bold)
+    if (e.layer == layer || layer < 0) ofLabel[e.label].push_back(e);
+  for (const auto& [label, edges] : ofLabel) {
+    out << "<path class=\"b\" stroke=\"" << hex(lineColour(D, colour, label)) << "\" d=\"";
+    for (const BoldEdge& e : edges) putSegment(out, D.nodes[e.a], D.nodes[e.b]);
+    out << "\"/>\n";
+  }
+}
+
+constexpr const char* boldStyle =
+    "<style>.b{fill:none;stroke-opacity:1;stroke-width:24;stroke-linecap:round;stroke-linejoin:"
+    "round}</style>\n";
+
+/// The seen facets layer by layer, each with the bold edges in it. Without thin edges each facet is
+/// stroked in its own colour, which closes the seams.
+void putFacets(Text& out, const Drawing& D, Colour colour, bool edges) {
+  out << "<g transform=\"scale(.1)\" stroke-linejoin=\"round\" "
+      << (edges ? "stroke=\"#223\" stroke-opacity=\".55\" stroke-width=\"4\">\n"
+                : "stroke-width=\"8\">\n");
+  int layer = 0;
+  for (const auto& [key, facets] : pathsOf(D)) {
+    for (; layer < key[0]; ++layer) putBoldEdges(out, D, colour, layer);
+    const std::string fill = hex(D.legend.entries[key[1]].colour, lightOf(key[2]));
+    out << "<path fill=\"" << fill << (edges ? "" : "\" stroke=\"" + fill) << "\" d=\"";
+    for (int f : facets) putTriangle(out, D.seen[f]);
+    out << "\"/>\n";
+  }
+  putBoldEdges(out, D, colour, layer);
+  out << "</g>\n";
+}
+
+std::vector<Triangle3> scaled(const std::vector<Triangle3>& seen, double factor) {
+  std::vector<Triangle3> all = seen;
+  for (Triangle3& t : all)
+    for (Vec3& p : t) p = factor * p;
+  return all;
+}
+
+ItemBuffer sampled(const Drawing& D, double perPixel) {
+  return itemBuffer(scaled(D.seen, perPixel), static_cast<int>(D.width * perPixel) + 1,
+                    static_cast<int>(D.height * perPixel) + 1);
+}
+
+/// The colours at the centres of squares of this size, equal ones of a row as one line.
+void putSquares(Text& out, const Drawing& D, Colour colour, double size) {
+  const ItemBuffer B = sampled(D, 1 / size);
+  std::map<std::pair<int, int>, std::vector<std::array<int, 3>>> runs;  // of colour, tone
+  auto lookAt = [&](int x, int y) {
+    const int f = x < B.width ? B.item[y * B.width + x] : -1;
+    return f < 0 ? std::pair<int, int>{-1, 0}
+                 : std::pair<int, int>{D.facets[f].colour, D.facets[f].tone};
+  };
+  for (int y = 0; y < B.height; ++y)
+    for (int x = 0, start = 0; x < B.width; ++x) {
+      if (lookAt(x + 1, y) == lookAt(x, y)) continue;
+      if (lookAt(x, y).first >= 0) runs[lookAt(x, y)].push_back({start, y, x + 1 - start});
+      start = x + 1;
+    }
+  out << format("<g transform=\"scale(%g) translate(0 .5)\" stroke-width=\"1.05\">\n", size);
+  for (const auto& [look, list] : runs) {
+    out << "<path stroke=\"" << hex(D.legend.entries[look.first].colour, lightOf(look.second))
+        << "\" d=\"";
+    for (const auto& [x, y, n] : list) out << "M" << x << " " << y << "h" << n;
+    out << "\"/>\n";
+  }
+  out << "</g>\n<g transform=\"scale(.1)\">\n";
+  putBoldEdges(out, D, colour, -1);
+  out << "</g>\n";
+}
+
+/// The mesh itself, below maxBytes: with edges, without them, or as coloured squares.
+void putMesh(Text& out, Drawing& D, Colour colour) {
+  constexpr int withEdges = 9000, facetsAtMost = 13000;  // about 20 bytes each
+  constexpr std::size_t maxBytes = 280000;
+  if (D.visible <= facetsAtMost) {
+    if (D.visible > withEdges) D.reduced = "too many for their edges to be drawn";
+    putFacets(out, D, colour, D.visible <= withEdges);
+    return;
+  }
+  std::string squares;
+  for (double size : {1.5, 2., 2.5, 3., 4.}) {
+    Text text;
+    putSquares(text, D, colour, size);
+    squares = text.take();
+    D.reduced = format("drawn as squares of %g pixels", size);
+    if (squares.size() < maxBytes) break;
+  }
+  out << squares;
+}
+
+void putBar(Text& out, const Legend& legend, double x, double y) {
+  constexpr double step = 9, width = 18;
+  for (int c = 0; c < legend.bar; ++c)
+    putRectangle(out, x, y + step * (legend.bar - 1 - c), width, step + .3,
+                 hex(legend.entries[c].colour));
+  const double height = step * legend.bar;
+  putRectangle(out, x, y, width, height, "none", " stroke=\"#444\" stroke-width=\".7\"");
+  for (int i = 0; i <= 5; ++i) {
+    const double at = y + height * (1 - i / 5.);
+    out << format("<path d=\"M%.1f %.1fh5\" stroke=\"#444\" stroke-width=\".7\"/>\n", x + width,
+                  at);
+    putText(out, x + width + 9, at + 4.5, format("%g", i / 5.));
+  }
+}
+
+/// The legend's lower end.
+double putLegend(Text& out, const Legend& legend, double x, double y) {
+  constexpr std::size_t most = 22;  // entries
+  putText(out, x, y + 11, legend.title, " font-weight=\"bold\"");
+  y += 26;
+  if (legend.bar > 0) {
+    putBar(out, legend, x, y);
+    y += 9 * legend.bar + 18;
+  }
+  const std::size_t end = std::min(legend.entries.size(), legend.bar + most);
+  for (std::size_t i = legend.bar; i < end; ++i, y += 20) {
+    putRectangle(out, x, y, 18, 13, hex(legend.entries[i].colour),
+                 " stroke=\"#444\" stroke-width=\".7\"");
+    putText(out, x + 27, y + 11, escaped(legend.entries[i].text, 18));
+  }
+  if (end == legend.entries.size()) return y;
+  putText(out, x + 27, y + 11,
+          format("and %d more", static_cast<int>(legend.entries.size() - end)));
+  return y + 20;
+}
+
+/// The axes' directions, as seen, around (x, y).
+void putTriad(Text& out, const Cut& cut, double x, double y) {
+  constexpr double length = 30;
+  const View view = viewOf(cut);
+  const Vec3 axes[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+  for (int i = 0; i < 3; ++i) {
+    const Vec3 tip = length * view(axes[i]);
+    const double reach = 1 + 9 / std::max(9., std::hypot(tip.x, tip.y));
+    out << format("<path d=\"M%.1f %.1fl%.1f %.1f\" stroke=\"#222\" stroke-width=\"1.4\"/>\n", x, y,
+                  tip.x, tip.y);
+    putText(out, x + reach * tip.x, y + reach * tip.y + 4, std::string(1, axisNames[i]),
+            " text-anchor=\"middle\" font-style=\"italic\"");
+  }
+}
+
+std::vector<std::string> captionOf(const Mesh& M, const PictureOptions& o, const Drawing& D) {
+  const QualityStatistics q = qualityStatistics(M);
+  std::vector<std::string> lines{
+      format("Behind %s: %d of %d tetrahedra, %d faces seen", nameOf(o.cut).c_str(), D.shown,
+             q.tetrahedra, D.visible),
+      format("q of all tetrahedra: min %.3f, mean %.3f, std dev %.3f; inverted %d", q.min, q.mean,
+             q.stdDev, q.inverted)};
+  if (!o.line.empty()) lines.push_back("Bold: where the surface will come");
+  if (M.xi.empty()) lines.push_back("Ideal elements: regular tetrahedra");
+  if (!D.reduced.empty()) lines.push_back("Faces are " + D.reduced);
+  return lines;
+}
+
+void checkCut(const Mesh& M, const Cut& cut) {
+  if (M.tets.empty()) fail("picture: the mesh has no tetrahedra; nothing can be drawn");
+  const Box box = boxOf(M.x);
+  const double low = component(box.low, cut.axis), high = component(box.high, cut.axis);
+  if (!(cut.value > low && cut.value < high))
+    fail("picture: the cut " + nameOf(cut) + " is not inside the mesh, which reaches from " +
+         format("%.6g to %.6g", low, high) + "; choose a value between");
+}
+
+Drawing drawingOf(const Mesh& M, const PictureOptions& o) {
+  constexpr double samplesPerPixel = 2;
+  Drawing D;
+  D.facets = facetsBehind(M, o.cut, o.colour == Colour::surface, D.shown);
+  if (D.shown == 0)
+    fail("picture: no tetrahedron has its centre behind " + nameOf(o.cut) + "; move the cut");
+  D.legend = colourFacets(M, o, D.facets);
+  place(D, M, o.cut);
+  D.layer = paintingLayers(scaled(D.seen, samplesPerPixel), sampled(D, samplesPerPixel));
+  D.bold = boldEdges(M, D.facets, D.layer);
+  for (int layer : D.layer) D.visible += layer >= 0;
+  return D;
+}
+
+/// Where the surface will come: on the cut plane, over all.
+void putLine(Text& out, const Mesh& M, const PictureOptions& o, Vec3 corner) {
+  const View view = scaledView(o.cut, boxOf(M.x));
+  out << "<path transform=\"scale(.1)\" class=\"b\" stroke=\"" << hex(sheetLine) << "\" d=\"";
+  for (const Segment& s : o.line) putSegment(out, view(s.a) - corner, view(s.b) - corner);
+  out << "\"/>\n";
+}
+
+/// The picture as SVG, below 300 kB. Errors: InputError where the cut shows nothing, or the mesh
+/// does not have what gives the colours.
+std::string pictureText(const Mesh& M, const PictureOptions& o) {
+  constexpr double margin = 24, gap = 30, legendWidth = 165, lineHeight = 19, triadSize = 96;
+  checkCut(M, o.cut);
+  Drawing D = drawingOf(M, o);
+  Text mesh, side;
+  putMesh(mesh, D, o.colour);
+  if (!o.line.empty()) putLine(mesh, M, o, D.corner);
+  const std::vector<std::string> caption = captionOf(M, o, D);
+  const double meshWidth = std::max(D.width, 390.), x = margin + meshWidth + gap;
+  const double legendEnd = putLegend(side, D.legend, x, margin + lineHeight) + triadSize;
+  const double bottom = std::max(margin + lineHeight + 8 + D.height, legendEnd);
+  putTriad(side, o.cut, x + 45, bottom - 40);
+  Text out;
+  const int lines = static_cast<int>(caption.size());
+  putPage(out, x + legendWidth, bottom + gap + lineHeight * lines, escaped(o.title, 200));
+  out << boldStyle;
+  putText(out, margin, margin + 6, escaped(o.title, 50), " font-weight=\"bold\" font-size=\"15\"");
+  const double top = margin + lineHeight + 8 + .5 * (bottom - margin - lineHeight - 8 - D.height);
+  out << format("<g transform=\"translate(%.1f %.1f)\">\n", margin + .5 * (meshWidth - D.width),
+                top)
+      << mesh.take() << "</g>\n"
+      << side.take();
+  for (int i = 0; i < lines; ++i)
+    putText(out, margin, bottom + gap - 4 + lineHeight * i, caption[i]);
+  out << "</svg>\n";
+  return out.take();
+}
+
+// ---- Figure 9
+
+/// 1, 2 or 5 times a power of ten: at most five steps up to the value.
+int roundStep(int value) {
+  for (int ten = 1;; ten *= 10)
+    for (int step : {1, 2, 5})
+      if (value <= 5 * std::int64_t(step) * ten || ten >= 100000000) return step * ten;
+}
+
+void putHistogramAxes(Text& out, double x, double y, double width, double height, int highest) {
+  const int step = roundStep(highest);
+  for (int n = 0; n <= highest; n += step) {
+    const double at = y + height * (1 - double(n) / highest);
+    out << format("<path d=\"M%.1f %.1fh%.1f\" stroke=\"%s\" stroke-width=\".7\"/>\n", x, at, width,
+                  n == 0 ? "#444" : "#ddd");
+    putText(out, x - 8, at + 4.5, format("%d", n), " text-anchor=\"end\"");
+  }
+  for (int i = 0; i <= 10; ++i)
+    putText(out, x + width * i / 10, y + height + 19, format("%g", i / 10.),
+            " text-anchor=\"middle\"");
+  putText(out, x + width / 2, y + height + 40, "quality q", " text-anchor=\"middle\"");
+  putText(out, x - 60, y - 14, "tetrahedra");
+}
+
+/// Figure 9: how many tetrahedra have which quality, in 20 classes.
+std::string histogramText(const QualityStatistics& q, const std::string& title, const char* ideal) {
+  constexpr double x = 84, y = 84, width = 560, height = 280, margin = 24;
+  const int highest = std::max(1, *std::max_element(q.histogram.begin(), q.histogram.end()));
+  Text out;
+  putPage(out, x + width + margin, y + height + 106, escaped(title, 200));
+  putText(out, margin, margin + 6, escaped(title, 50), " font-weight=\"bold\" font-size=\"15\"");
+  putHistogramAxes(out, x, y, width, height, highest);
+  const double step = width / qualityClasses;
+  auto bar = [&](int c, int n, const std::string& fill) {
+    putRectangle(out, x + step * c + 1, y + height * (1 - double(n) / highest), step - 2,
+                 height * n / highest, fill, " stroke=\"#223\" stroke-width=\".5\"");
+  };
+  for (int c = 0; c < qualityClasses; ++c) {
+    const int n = q.histogram[c];
+    if (n == 0) continue;
+    bar(c, n, hex(qualityColour(c)));
+    if (c == 0 && q.inverted > 0) bar(c, q.inverted, hex(invertedFill));
+    putText(out, x + step * (c + .5), y + height * (1 - double(n) / highest) - 4, format("%d", n),
+            " text-anchor=\"middle\" font-size=\"9\"");
+  }
+  putText(out, margin, y + height + 68,
+          format("%d tetrahedra, inverted %d; ideal: %s", q.tetrahedra, q.inverted, ideal));
+  putText(out, margin, y + height + 87,
+          format("q: min %.3f, max %.3f, mean %.3f, std dev %.3f", q.min, q.max, q.mean, q.stdDev));
+  out << "</svg>\n";
+  return out.take();
 }
 
 // ==== Arguments =================================================================================
@@ -2318,6 +3163,14 @@ struct Arguments {
     if (!isMeshSuffix(suffixOf(path)) && !isDevice(path))
       throw UsageError("'" + path + "' does not end in " + meshSuffixes +
                        ", the formats of the output");
+    return path;
+  }
+  /// The picture an option names: an .svg file, or a device; "" where the option is not given.
+  std::string svg(const char* option) const {
+    if (!has(option)) return "";
+    const std::string& path = options.at(option)[0];
+    if (fs::path(path).extension() != ".svg" && !isDevice(path))
+      throw UsageError("'" + path + "' does not end in .svg, the format of a picture");
     return path;
   }
 };
@@ -2386,6 +3239,9 @@ std::string regularLine(const QualityStatistics& q) {
       "std dev %.4f\n",
       q.inverted, q.min, q.max, q.mean, q.stdDev);
 }
+
+/// A file's name without its folder.
+std::string nameOf(const std::string& path) { return fs::path(path).filename().string(); }
 
 std::string sizeOf(const Mesh& M) {
   return std::to_string(M.x.size()) + " nodes, " + std::to_string(M.tets.size()) + " tetrahedra";
@@ -2529,9 +3385,12 @@ InsertOptions insertOptions(const Arguments& a) {
 /// the way that was taken are written. With several surfaces their number follows the prefix:
 /// PREFIX-2-projected.vtk.
 struct Stages {
-  std::string prefix;  // empty: none are kept
+  std::string prefix;    // empty: none are kept
+  std::string pictures;  // the same for --pictures PREFIX
   bool several = false;
-  int surface = 0, way = 0;  // under way
+  Cut cut = {};                    // of all pictures
+  std::vector<Segment> line = {};  // where the surfaces meet it
+  int surface = 0, way = 0;        // under way
   struct Kept {
     int surface, way;  // 0: whichever
     Output output;
@@ -2541,6 +3400,19 @@ struct Stages {
   void keep(const std::string& name, const Mesh& M, int ofSurface, int ofWay) {
     if (!prefix.empty())
       kept.push_back({ofSurface, ofWay, {prefix + '-' + name + ".vtk", vtkText(M)}});
+    if (pictures.empty()) return;
+    PictureOptions o{cut, Colour::quality, name};
+    if (ofSurface == 0) o.line = line;
+    kept.push_back({ofSurface, ofWay, {pictures + '_' + name + ".svg", pictureText(M, o)}});
+  }
+  void cutAcross(const std::vector<TriangleSurface>& surfaces, const Mesh& M) {
+    std::vector<Triangle3> triangles;
+    for (const TriangleSurface& S : surfaces) {
+      const std::vector<Triangle3> more = trianglesOf(S);
+      triangles.insert(triangles.end(), more.begin(), more.end());
+    }
+    cut = defaultCut(triangles, M);
+    line = sectionOf(triangles, cut);
   }
   void see(const std::string& stage, const Mesh& M) {
     const int k = static_cast<int>(M.surfaces.size());
@@ -2593,12 +3465,15 @@ void runInsert(const Arguments& a, const Streams& io) {
       throw UsageError("the mesh and a stage would both be written to " + path);
   checkWritable(path);
   if (!prefix.empty()) checkWritable(prefix + "-original.vtk");
+  const std::string pictures = a.has("--pictures") ? a.options.at("--pictures")[0] : "";
+  if (!pictures.empty()) checkWritable(pictures + "_original.svg");
   Mesh M = readMesh(a.operands[0]);
   checkInsertable(a.operands[0], M);
   Progress progress(io, a.has("--quiet"));
   progress.line("mesh " + a.operands[0] + ": " + sizeOf(M));
   const std::vector<TriangleSurface> surfaces = readSurfaces(a, progress);
-  Stages stages{prefix, surfaces.size() > 1};
+  Stages stages{prefix, pictures, surfaces.size() > 1};
+  if (!pictures.empty()) stages.cutAcross(surfaces, M);
   stages.keep("original", M, 0, 0);
   options.onStage = [&](const char* stage, const Mesh& mesh) { stages.see(stage, mesh); };
   options.onProgress = [&](const std::string& line) { progress.line(line); };
@@ -2690,18 +3565,55 @@ void runOptimize(const Arguments& a, const Streams& io) {
 }
 
 void runStats(const Arguments& a, const Streams& io) {
+  const std::string histogram = a.svg("--histogram");
+  if (!histogram.empty()) checkWritable(histogram);
   const Mesh M = readMesh(a.operands[0]);
   const QualityStatistics regular = qualityStatistics(M, Ideal::regular);
   io.out << a.operands[0] << ": " << sizeOf(M) << "\n";
   for (std::size_t k = 1; k <= M.surfaces.size(); ++k)
     io.out << "surface " << k << " (" << M.surfaces[k - 1].name
            << "): " << surfaceFaces(M, static_cast<int>(k)).size() << " triangles\n";
-  if (M.xi.empty()) {
+  const QualityStatistics q = qualityStatistics(M);
+  if (M.xi.empty())
     io.out << tableI({{"regular", &regular}});
-    return;
-  }
-  const QualityStatistics computational = qualityStatistics(M);
-  io.out << tableI({{"computational", &computational}, {"regular", &regular}});
+  else
+    io.out << tableI({{"computational", &q}, {"regular", &regular}});
+  if (histogram.empty()) return;
+  if (!io.out.flush()) fail("standard output: the results cannot be written; nothing was written");
+  const char* ideal = M.xi.empty() ? "regular tetrahedra" : "computational tetrahedra";
+  writeFiles({{histogram, histogramText(q, nameOf(a.operands[0]), ideal)}});
+}
+
+/// "y=.5": a plane.
+Cut parseCut(const std::string& word) {
+  Cut cut;
+  const std::size_t axis = word.empty() ? std::string::npos : std::string("xyz").find(word[0]);
+  if (axis == std::string::npos || word.size() < 3 || word[1] != '=' ||
+      !parse(std::string_view(word).substr(2), cut.value) || !std::isfinite(cut.value))
+    throw UsageError("'" + word + "' is no plane for --cut; it is written x=1.5, y=1.5 or z=1.5");
+  cut.axis = static_cast<int>(axis);
+  return cut;
+}
+
+Colour parseColour(const std::string& word) {
+  if (word == "quality") return Colour::quality;
+  if (word == "level") return Colour::level;
+  if (word == "surface") return Colour::surface;
+  throw UsageError("'" + word + "' is no --colour; it is quality, level or surface");
+}
+
+void runPicture(const Arguments& a, const Streams& io) {
+  const std::string path = a.svg("-o");
+  if (path.empty()) throw UsageError("the output is missing: -o OUT.svg");
+  PictureOptions o;
+  if (a.has("--colour")) o.colour = parseColour(a.options.at("--colour")[0]);
+  if (a.has("--cut")) o.cut = parseCut(a.options.at("--cut")[0]);
+  checkWritable(path);
+  const Mesh M = readMesh(a.operands[0]);
+  if (!a.has("--cut") && !M.x.empty()) o.cut = defaultCut(insertedTriangles(M), M);
+  o.title = nameOf(a.operands[0]);
+  writeFiles({{path, pictureText(M, o)}});
+  io.err << path << ": behind " << nameOf(o.cut) << std::endl;
 }
 
 void convertMesh(const std::string& in, const std::string& out, const Streams& io,
@@ -2831,6 +3743,7 @@ const std::vector<Command>& commands() {
         {"--stages", "PREFIX",
          "also write PREFIX-{original,refined,projected,smoothed}.vtk (of several surfaces\n"
          "                       PREFIX-1-refined.vtk, ...)"},
+        {"--pictures", "PREFIX", "also draw PREFIX_original.svg and so on, as `picture` does"},
         maxTetsOption,
         quietOption},
        runInsert},
@@ -2854,8 +3767,24 @@ const std::vector<Command>& commands() {
        "Prints the quality statistics of a tetrahedral mesh, as in Table I.",
        1,
        1,
-       {},
+       {{"--histogram", "H.svg", "also draw the number of tetrahedra in 20 classes of quality"}},
        runStats},
+      {"picture",
+       "MESH",
+       "Draws the tetrahedra whose centres are behind a plane, the eye being where x is high, y "
+       "low\n"
+       "or z high. Inserted surfaces are bold lines, orange where a face of theirs is seen;\n"
+       "--colour surface shows them whole. Where too many faces are seen, edges are left out, "
+       "then\n"
+       "squares are drawn: the file stays below 300 kB.",
+       1,
+       1,
+       {{"-o", "OUT.svg", "the picture to write"},
+        {"--cut", "x|y|z=VALUE",
+         "the plane (default: through the middle of the inserted surfaces, across them)"},
+        {"--colour", "quality|level|surface",
+         "quality q (default), level of bisection, or surface"}},
+       runPicture},
       {"convert",
        "IN OUT",
        "Writes a mesh or surfaces in the format of OUT's suffix. Meshes: .vtk, .msh (Gmsh 2.2), "

@@ -33,7 +33,7 @@ enum class Order { asListed, reversed, largestFirst };
 /// What a row must reach; 0 asks for nothing but a valid mesh.
 struct Figures {
   double min = 0, mean = 0;
-  double hausdorff = 0;  // at most, of l_c
+  double hausdorff = 0;  // at most, of the row's l_c
   double shift = 0;      // tangential, at most, of h
 };
 
@@ -48,7 +48,8 @@ struct Row {
   Figures figures = {};
   std::vector<std::string> refused = {};  // not empty: must be refused, the message has all these
   Order order = Order::asListed;
-  bool slow = false;  // run only where named
+  bool slow = false;    // run only where named
+  bool sample = false;  // the files are the project's own, of the box of samples/faults
   bool valid = true;  // false: either outcome will do
 };
 
@@ -64,6 +65,16 @@ std::vector<Row> rows() {
       row.figures = set, row.order = order;
       all.push_back(row);
       row.name = files + std::string(" 2400") + suffix, row.lc = 2400, row.figures = {};
+      all.push_back(row);
+    }
+  for (const auto& [suffix, order] : orders)
+    for (double lc : {.12, .06}) {
+      Row row{(lc == .12 ? "samples/faults .12" : "samples/faults .06") + std::string(suffix),
+              {"samples/faults/west.ts", "samples/faults/east.ts", "samples/faults/ring.ts",
+               "samples/faults/lobe.ts"},
+              lc};
+      row.figures = {lc == .12 ? .45 : .42, .9, .2, 0};
+      row.order = order, row.sample = true;
       all.push_back(row);
     }
   Row crossing{"cfm_neg_crossing_pair", {"cfm_neg_crossing_pair"}, 1200};
@@ -89,7 +100,8 @@ double areaOf(const TriangleSurface& S) {
   return area;
 }
 
-std::vector<TriangleSurface> surfacesOf(const Row& row, const std::string& data) {
+std::vector<TriangleSurface> surfacesOf(const Row& row, std::string data) {
+  if (row.sample) data = ".";
   std::vector<std::string> files;
   for (const std::string& file : row.files) {
     if (!fs::is_directory(data + "/" + file)) {
@@ -116,6 +128,7 @@ std::vector<TriangleSurface> surfacesOf(const Row& row, const std::string& data)
 
 /// A box of cubic cells, 8 h wide where l_c is given, with the row's margin at least.
 Mesh boxAround(const std::vector<TriangleSurface>& surfaces, Row& row) {
+  if (row.sample) return boxMesh({0, 0, 0}, {4, 3, 2}, {8, 6, 4});
   Vec3 lo{1e300, 1e300, 1e300}, hi{-1e300, -1e300, -1e300};
   for (const TriangleSurface& S : surfaces)
     for (Vec3 p : S.points) {
@@ -152,7 +165,7 @@ std::string missed(const Row& row, const Mesh& M, const std::vector<InsertReport
     const bool isCoyote = M.surfaces[r.surface - 1].name.find("PHTS-COYT") != std::string::npos;
     const double hausdorff = isCoyote ? .3 : row.figures.hausdorff;  // its lobes overlap
     if (row.figures.hausdorff > 0)
-      demand(r.hausdorff <= hausdorff * r.lc, format("H/lc %.2f", r.hausdorff / r.lc));
+      demand(r.hausdorff <= hausdorff * row.lc, format("H/lc %.2f", r.hausdorff / row.lc));
     if (row.figures.shift > 0)
       demand(r.tangentialShift <= row.figures.shift * h,
              format("shift/h %.2f", r.tangentialShift / h));

@@ -190,6 +190,8 @@ TEST_SUITE("files") {
     Folder folder;
     CHECK(has(messageOf([&] { readFile(folder / "none.obj"); }), "none.obj: cannot be read"));
     CHECK(has(messageOf([&] { readFile(folder.path.string()); }), "this is a folder"));
+    if (fs::exists("/proc/self/mem"))  // nothing is at its beginning
+      CHECK(has(messageOf([&] { readFile("/proc/self/mem"); }), "reading broke off"));
   }
 
   TEST_CASE("VTK: a box is read back as it was, member by member") {
@@ -286,6 +288,18 @@ TEST_SUITE("files") {
     struct Rule { std::string from, to, what; };
     const Rule rules[] = {
         {"# vtk DataFile", "solid", "no VTK legacy file"},
+        {"ASCII", "TEXT", "'TEXT' is where ASCII should be"},
+        {"CELL_TYPES 18", "CELLS 0 0\nCELL_TYPES 18", "a second CELLS section"},
+        {"cube 3 1 double", "cube 1 3 double", "array 'cube' has 1 components, not 3"},
+        {"cube 3 1 double", "cube 0 1 double", "array 'cube' has no components"},
+        {"SCALARS level int\nLOOKUP_TABLE", "SCALARS level int\nTABLE",
+         "'TABLE' is where LOOKUP_TABLE should be"},
+        {"SCALARS level int", "SCALARS level int 12", "an attribute has 1 to 9 components"},
+        {"SCALARS level int\nLOOKUP_TABLE default\n0",
+         "SCALARS level int\nLOOKUP_TABLE default\n-1", "tetrahedron 0 has no level"},
+        {"surface_u 2 24 double\n0 0", "surface_u 2 24 double\n0 2", "not in [0,1]^2"},
+        {"curve_side 1 24 int\n-3", "curve_side 1 24 int\n0", "a side in 'curve_side' is 0"},
+        {"curve_s 1 24 double\n0", "curve_s 1 24 double\nnan", "a number that is not finite"},
         {"ASCII", "BINARY", "binary"},
         {"UNSTRUCTURED_GRID", "POLYDATA", "no UNSTRUCTURED_GRID"},
         {"POINTS 8 double\n0 0 0", "POINTS 8 double\n0 nan 0", "not finite"},
@@ -334,12 +348,41 @@ TEST_SUITE("files") {
     for (std::size_t E = 0; E < M.tets.size(); ++E) zeros += "0\n";
     CHECK(has(vtkError(with(text, tag + zeros + "-1", tag + zeros + "0")), "no patch is named"));
     CHECK(has(vtkError(with(text, tag + zeros + "-1", tag + zeros + "1")), "no patch is named"));
-    // a triangle across the box is no face of it
-    const std::string face = "\n3 ";
-    const std::size_t at = text.find(face), end = text.find('\n', at + 1);
+    // one tetrahedron's face inside, named as one of the boundary
+    const std::size_t cells = text.find("CELLS"), at = text.find("\n3 ", cells);
     std::string broken = text;
-    broken.replace(at, end - at, "\n3 0 4 11");
-    CHECK(vtkError(broken) != "");
+    broken.replace(at, text.find('\n', at + 1) - at, "\n3 0 1 11");
+    CHECK_MESSAGE(has(vtkError(broken), "no patch is named"), vtkError(broken));
+  }
+
+  TEST_CASE("VTK: a triangle across a cube is no face; a node on no surface has no dimension 2") {
+    std::string text = vtkText(boxMesh({0, 0, 0}, {1, 1, 1}, {1, 1, 1}));
+    const std::string inPlane = with(text, "dimension int\nLOOKUP_TABLE default\n0",
+                                     "dimension int\nLOOKUP_TABLE default\n2");
+    CHECK(has(vtkError(with(inPlane, "entity int\nLOOKUP_TABLE default\n1",
+                            "entity int\nLOOKUP_TABLE default\n0")),
+              "node 0 is on no surface, its dimension is 2"));
+    text = with(text, "CELLS 18 78\n", "CELLS 19 82\n3 1 2 4\n");
+    text = with(text, "CELL_TYPES 18\n", "CELL_TYPES 19\n5\n");
+    text = with(text, "CELL_DATA 18\n", "CELL_DATA 19\n");
+    for (const char* name : {"surface int", "level int", "quality double"}) {
+      const std::string head = name + std::string("\nLOOKUP_TABLE default\n");
+      text = with(text, head, head + "0\n");
+    }
+    CHECK_MESSAGE(has(vtkError(text), "the triangle of nodes 1 2 4 is no face"), vtkError(text));
+  }
+
+  TEST_CASE("VTK: cells without types, offsets that fall, data of other length than the cells") {
+    const std::string two = twoTets;
+    CHECK(has(vtkError(two.substr(0, two.find("CELL_TYPES"))), "it has 3 cells and 0 cell types"));
+    CHECK(has(vtkError("# vtk DataFile Version 5.1\nv5\nASCII\nDATASET UNSTRUCTURED_GRID\n"
+                       "POINTS 4 float\n0 0 0 1 0 0 0 1 0 0 0 1\n"
+                       "CELLS 2 4\nOFFSETS vtktypeint64\n4 0\n"),
+              "the offsets do not grow from 0 to 4"));
+    // a list named as the labels are, with one entry for three cells
+    const Mesh M =
+        parseVtk("m.vtk", two + "CELL_DATA 3\nFIELD FieldData 1\nsurface 1 1 int\n1\n");
+    CHECK(M.faceLabel.empty());
   }
 
   TEST_CASE("VTK: tetrahedra from elsewhere are read as they are, inverted ones too") {
@@ -555,7 +598,7 @@ TEST_SUITE("formats") {
       for (std::size_t t = 0; t < S.triangles.size(); ++t)
         for (int i = 0; i < 3; ++i) {
           const Vec3 x = S.points[S.triangles[t][i]], y = R[0].points[R[0].triangles[t][i]];
-          const Vec3 rounded{double(float(x.x)), double(float(x.y)), double(float(x.z))};
+          const Vec3 rounded{nearestFloat(x.x), nearestFloat(x.y), nearestFloat(x.z)};
           different += !(y == (stl ? rounded : x));
         }
       CHECK(different == 0);
@@ -869,6 +912,9 @@ TEST_SUITE("formats") {
     other.tets[5] = bent.tets[7];
     refused(in, folder.file("o.vtk", vtkText(other)), "tetrahedron 5 has other nodes");
     other = bent;
+    for (int n : other.tets[5]) other.x[n].x = 0;
+    refused(in, folder.file("f.vtk", vtkText(other)), "has no volume");
+    other = bent;
     other.x[13] = {3.3, 1.9, 2.7};
     refused(in, folder.file("i.vtk", vtkText(other)), "tetrahedra are inverted");
     refused(folder.file("r.vtk", vtkText(rest)), in, "has computational elements");
@@ -949,6 +995,8 @@ TEST_SUITE("command line") {
         {{"box", "-o", "a.stl"}, "'a.stl' does not end in .vtk, .msh or .mesh"},
         {{"box", "a.vtk", "-o", "a.vtk"}, "'a.vtk' is too much, no file is read"},
         {{"stats"}, "needed: MESH, given: 0 files"},
+        {{"insert", "m.vtk", "s.obj", "-o", "a-refined.vtk", "--lc", "1", "--stages", "a"},
+         "the mesh and a stage would both be written to a-refined.vtk"},
         {{"convert", "a.vtk", "a.doc"}, "'a.doc' ends neither in .vtk, .msh or .mesh (meshes)"}};
     for (const auto& [words, what] : rules) {
       const Outcome o = call(words);
@@ -966,6 +1014,18 @@ TEST_SUITE("command line") {
       CHECK(has(call({"--help"}).out, c.name));
     }
     CHECK(call({"--version"}).out == std::string("meccano ") + version + "\n");
+  }
+
+  TEST_CASE("memory that does not suffice is an error like the others") {
+    struct Full : std::streambuf {
+      int overflow(int) override { throw std::bad_alloc(); }
+    } full;
+    std::ostream out(&full);
+    out.exceptions(std::ios::badbit);
+    std::ostringstream err;
+    CHECK(run({"--version"}, {out, err, false}) == 1);
+    CHECK(err.str() ==
+          "meccano: the memory does not suffice; use a larger --lc or a coarser mesh\n");
   }
 
   TEST_CASE("a standard output that cannot be written is an error") {
@@ -1099,7 +1159,9 @@ TEST_SUITE("command line") {
     CHECK(norm(R.x[13] - Vec3{.5, .5, .5}) < 1e-2);
     CHECK(R.tets == plain.tets);
     const std::string bad = folder.file("bad.vtk", twoTets);  // nothing can move in it
-    CHECK(call({"optimize", bad, "-o", folder / "x.vtk"}).status == 1);
+    const Outcome inverted = call({"optimize", bad, "-o", folder / "x.vtk"});
+    CHECK(inverted.status == 1);
+    CHECK_MESSAGE(has(inverted.err, "elements are still inverted after "), inverted.err);
     CHECK(!fs::exists(folder / "x.vtk"));
     CHECK(call({"optimize", in, "-o", out, "--max-sweeps", "0"}).status == 1);
     CHECK(call({"optimize", in, "-o", out, "--max-disp", "-1"}).status == 1);

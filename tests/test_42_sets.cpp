@@ -1,0 +1,275 @@
+// SPDX-License-Identifier: MIT
+// §4.2: several surfaces in one call, one after the other, near each other, and refused together.
+#include <doctest/doctest.h>
+
+#include <algorithm>
+#include <string>
+#include <vector>
+
+#include "../meccano.hpp"
+#include "../samples/surfaces.hpp"
+#include "shapes.hpp"
+
+using namespace meccano;
+
+namespace {
+
+/// A square sheet of this half width around c, a little bent.
+TriangleSurface sheetAt(Vec3 c, double half, double bend, const std::string& name) {
+  TriangleSurface S = samples::sheet(8, 8, [=](double s, double t) {
+    return c + Vec3{half * s, half * t, bend * s * t + .5 * bend * s * s};
+  });
+  S.name = name;
+  return S;
+}
+
+Mesh box() { return boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4}); }
+
+InsertOptions withSize(double lc) {
+  InsertOptions options;
+  options.lc = lc;
+  options.optimize.power = 1;  // speed: what is promised holds without
+  return options;
+}
+
+/// Each surface of the call is a disk of the mesh on its own S, by its name.
+void checkSurfaces(const Mesh& M, const std::vector<TriangleSurface>& S,
+                   const std::vector<InsertReport>& reports) {
+  CHECK(shapes::countInverted(M) == 0);
+  CHECK(shapes::conformityFault(M) == "");
+  CHECK(shapes::totalVolume(M) == doctest::Approx(1).epsilon(1e-10));
+  REQUIRE(reports.size() == S.size());
+  REQUIRE(M.surfaces.size() == S.size());
+  std::vector<int> surfaceAt(M.x.size(), 0);
+  int shared = 0;
+  for (std::size_t i = 0; i < S.size(); ++i) {
+    const int k = static_cast<int>(i) + 1;
+    CHECK(M.surfaces[i].name == S[i].name);
+    CHECK(reports[i].surface == k);
+    const std::vector<shapes::Face> faces = surfaceFaces(M, k);
+    CHECK(shapes::isDisk(faces));
+    const double distance = shapes::maxDistanceToSurface(M, k, S[i]);
+    CHECK(distance <= 1e-12 * shapes::diagonal(S[i]));
+    CHECK(reports[i].triangles == static_cast<int>(faces.size()));  // as it is at the end
+    CHECK(reports[i].hausdorff <= .3 * reports[i].lc);
+    for (const shapes::Face& f : faces)
+      for (int n : f) {
+        shared += surfaceAt[n] != 0 && surfaceAt[n] != k;  // faces of two surfaces do not touch
+        surfaceAt[n] = k;
+      }
+  }
+  CHECK(shared == 0);
+  CHECK(reports.back().smoothed.min == qualityStatistics(M).min);
+}
+
+std::string refusal(Mesh& M, const std::vector<TriangleSurface>& S, const InsertOptions& options) {
+  const Mesh before = M;
+  std::string text;
+  try {
+    insertSurfaces(M, S, options);
+  } catch (const Error& error) {
+    text = error.what();
+  }
+  CHECK(shapes::sameMesh(M, before));
+  return text;
+}
+
+bool has(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
+
+TriangleSurface together(const TriangleSurface& A, const TriangleSurface& B) {
+  TriangleSurface S = A;
+  const int n = static_cast<int>(A.points.size());
+  S.points.insert(S.points.end(), B.points.begin(), B.points.end());
+  for (const auto& t : B.triangles) S.triangles.push_back({t[0] + n, t[1] + n, t[2] + n});
+  return S;
+}
+
+}  // namespace
+
+TEST_SUITE("4.2") {
+  TEST_CASE("sets: three surfaces in one call, in two orders; as if inserted one by one") {
+    std::vector<TriangleSurface> S{sheetAt({.45, .5, .3}, .2, .03, "low"),
+                                   sheetAt({.55, .5, .52}, .2, -.03, "middle"),
+                                   sheetAt({.5, .5, .72}, .15, .02, "high")};
+    const InsertOptions options = withSize(.16);
+    Mesh M = box();
+    const std::vector<InsertReport> reports = insertSurfaces(M, S, options);
+    checkSurfaces(M, S, reports);
+    Mesh oneByOne = box();
+    for (const TriangleSurface& one : S) insertSurface(oneByOne, one, options);
+    CHECK(shapes::sameMesh(M, oneByOne));
+    std::reverse(S.begin(), S.end());
+    Mesh reversed = box();
+    checkSurfaces(reversed, S, insertSurfaces(reversed, S, options));
+  }
+
+  TEST_CASE("sets: surfaces nearer than l_c, down to half a cube") {
+    for (double gap : {.1, .05}) {
+      CAPTURE(gap);
+      const std::vector<TriangleSurface> S{sheetAt({.5, .5, .48}, .2, .03, "a"),
+                                           sheetAt({.52, .48, .48 + gap}, .2, .03, "b")};
+      Mesh M = box();
+      const std::vector<InsertReport> reports = insertSurfaces(M, S, withSize(.16));
+      checkSurfaces(M, S, reports);
+      CHECK(reports[1].lc == .16);  // two surfaces leave each other a free side
+    }
+  }
+
+  TEST_CASE("sets: a surface between two near ones lowers l_c by itself, and says why") {
+    const std::vector<TriangleSurface> S{sheetAt({.5, .5, .44}, .2, 0, "below"),
+                                         sheetAt({.5, .5, .54}, .2, 0, "above"),
+                                         sheetAt({.5, .5, .49}, .12, 0, "between")};
+    Mesh M = box();
+    const std::vector<InsertReport> reports = insertSurfaces(M, S, withSize(.16));
+    checkSurfaces(M, S, reports);
+    CHECK(reports[0].lc == .16);
+    CHECK(reports[2].lc < .16);
+    REQUIRE_FALSE(reports[2].warnings.empty());
+    const std::string& text = reports[2].warnings[0];
+    CAPTURE(text);
+    CHECK(has(text, "lowered from 0.16"));
+    CHECK(has(text, "is 0.05 away"));
+  }
+
+  TEST_CASE("sets: a gap that cannot be resolved is refused with the name, the distance and l_c") {
+    const std::vector<TriangleSurface> S{sheetAt({.5, .5, .5}, .1, 0, "one"),
+                                         sheetAt({.5, .5, .50001}, .1, 0, "too near")};
+    Mesh M = box();
+    InsertOptions options = withSize(.16);
+    options.optimize.maxSweeps = 10;
+    const std::string text = refusal(M, S, options);
+    CAPTURE(text);
+    CHECK(has(text, "surface 'too near'"));
+    CHECK(has(text, "surface 'one' is 1e-05 away"));
+    CHECK(has(text, "lower l_c to 5e-06"));
+  }
+
+  TEST_CASE("sets: surfaces that cross or touch are refused with both names and the place") {
+    const TriangleSurface a = sheetAt({.5, .5, .5}, .2, 0, "flat");
+    TriangleSurface b = sheetAt({.5, .5, .5}, .15, 0, "upright");
+    for (Vec3& p : b.points) p = {p.x, .5, p.y};
+    TriangleSurface c = sheetAt({.5, .5, .5}, .1, 0, "edge");
+    for (Vec3& p : c.points) p = {p.x, .5 + p.z - .5, .6 + p.y - .5};  // its rim lies in a
+    for (const TriangleSurface& other : {b, c}) {
+      Mesh M = box();
+      const std::string text = refusal(M, {a, other}, withSize(.16));
+      CAPTURE(text);
+      CHECK(has(text, "'flat'"));
+      CHECK(has(text, "'" + other.name + "'"));
+      CHECK(has(text, "cross or touch"));
+      CHECK(has(text, "near (0."));
+    }
+    Mesh M = box();
+    insertSurface(M, a, withSize(.16));
+    CHECK(has(refusal(M, {b}, withSize(.16)), "inserted surface 'flat' cross or touch"));
+  }
+
+  TEST_CASE("sets: all or none, and the message names the surface") {
+    const TriangleSurface good = sheetAt({.5, .5, .4}, .2, .03, "good");
+    const TriangleSurface outside = sheetAt({.5, .5, .95}, .2, 0, "near the lid");
+    Mesh M = box();
+    const std::string text = refusal(M, {good, outside}, withSize(.16));
+    CHECK(has(text, "surface 'near the lid': insertSurface (§3.2)"));
+    CHECK(has(text, "dist(∂M, S) = 0.05"));
+    TriangleSurface holed = sheetAt({.5, .5, .7}, .2, 0, "");
+    holed.triangles.erase(holed.triangles.begin() + 60);
+    CHECK(has(refusal(M, {good, holed}, withSize(.16)), "surface 2: "));
+    const InsertOptions none;
+    CHECK(has(refusal(M, {good}, none), "l_c"));
+    CHECK(insertSurfaces(M, {}, withSize(.16)).empty());
+  }
+
+  TEST_CASE("sets: a surface of two components becomes two, each with its name") {
+    const TriangleSurface a = sheetAt({.5, .5, .3}, .2, .03, "fault"),
+                          b = sheetAt({.5, .5, .7}, .2, .03, "fault");
+    Mesh M = box();
+    const std::vector<InsertReport> reports = insertSurfaces(M, {together(a, b)}, withSize(.16));
+    TriangleSurface first = a, second = b;
+    first.name = "fault.1", second.name = "fault.2";
+    checkSurfaces(M, {first, second}, reports);
+    REQUIRE(reports[0].warnings.size() == 1);
+    CHECK(has(reports[0].warnings[0], "2 components"));
+    std::vector<std::string> warnings;
+    CHECK(connectedComponents(a, warnings).size() == 1);
+    CHECK(warnings.empty());
+    TriangleSurface fan = together(a, b);  // parts that meet at a point stay one, to be refused
+    fan.points[a.points.size()] = a.points[0];
+    CHECK(connectedComponents(fan, warnings).size() == 1);
+    CHECK(has(refusal(M, {fan}, withSize(.16)), "meet only there"));
+  }
+
+  TEST_CASE("sets: refinement splits earlier surfaces at parametric midpoints, labels hold") {
+    const TriangleSurface a = sheetAt({.5, .5, .5}, .2, .05, "a");
+    Mesh M = box();
+    insertSurface(M, a, withSize(.2));
+    const std::size_t coarse = surfaceFaces(M, 1).size(), nodes = M.x.size();
+    std::vector<int> all(M.tets.size());
+    for (std::size_t E = 0; E < all.size(); ++E) all[E] = static_cast<int>(E);
+    for (int level = 0; level < 3; ++level) bisect(M, all);
+    CHECK(surfaceFaces(M, 1).size() > coarse);
+    CHECK(shapes::isDisk(surfaceFaces(M, 1)));
+    CHECK(shapes::maxDistanceToSurface(M, 1, a) <= 1e-12 * shapes::diagonal(a));
+    int onSurface = 0, onBoundary = 0;
+    for (std::size_t n = nodes; n < M.x.size(); ++n) {
+      onSurface += M.dimension[n] < 3 && M.entity[n] > 0;
+      onBoundary += M.dimension[n] == 2 && M.entity[n] < 0;
+    }
+    CHECK(onSurface > 0);
+    CHECK(onBoundary > 0);
+  }
+
+  TEST_CASE("sets: a slit narrower than the cubes is bridged, its rims overlapping or not") {
+    for (double overlap : {-.01, .02}) {
+      CAPTURE(overlap);
+      TriangleSurface S = samples::sheet(24, 24, [](double s, double t) {
+        return Vec3{.5 + .3 * s, .5 + .3 * t, .5};
+      });
+      // the sheet is cut from its middle to its rim along x = .5; the halves open or overlap
+      const std::size_t count = S.points.size();
+      std::vector<int> twin(count, -1);
+      for (std::size_t n = 0; n < count; ++n)
+        if (std::abs(S.points[n].x - .5) < 1e-9 && S.points[n].y > .51) {
+          twin[n] = static_cast<int>(S.points.size());
+          S.points.push_back(S.points[n]);
+        }
+      for (auto& t : S.triangles) {
+        double x = 0;
+        for (int n : t) x += S.points[n].x / 3;
+        for (int& n : t)
+          if (x > .5 && twin[n] >= 0) n = twin[n];
+      }
+      for (std::size_t n = 0; n < count; ++n)
+        if (twin[n] >= 0) {
+          const double open = (S.points[n].y - .5) / .3;
+          S.points[n] += open * Vec3{overlap, 0, -.02};
+          S.points[twin[n]] += open * Vec3{-overlap, 0, .02};
+        }
+      Mesh M = box();
+      InsertOptions options;
+      options.lc = .12;
+      const InsertReport report = insertSurface(M, S, options);
+      CHECK(shapes::countInverted(M) == 0);
+      CHECK(shapes::isDisk(surfaceFaces(M, 1)));
+      CHECK(shapes::maxDistanceToSurface(M, 1, S) <= 1e-12 * shapes::diagonal(S));
+      CHECK(report.hausdorff <= .4 * .12);
+      CHECK(report.smoothed.min > .2);
+      // the edges across the slit can be split: their new nodes stay beside them
+      const std::size_t nodes = M.x.size();
+      Bisection B(M);
+      int astray = 0;
+      for (const shapes::Face& f : surfaceFaces(M, 1))
+        for (int e = 0; e < 3; ++e) {
+          const int a = f[e], b = f[(e + 1) % 3], size = static_cast<int>(M.x.size());
+          B.bisectEdge(a, b);
+          const double length = norm(M.x[b] - M.x[a]);
+          if (static_cast<int>(M.x.size()) > size)
+            astray += norm(M.x.back() - .5 * (M.x[a] + M.x[b])) > 1.5 * length;
+        }
+      CHECK(M.x.size() > nodes);
+      CHECK(astray == 0);
+      CHECK(shapes::maxDistanceToSurface(M, 1, S) <= 1e-12 * shapes::diagonal(S));
+    }
+  }
+}
