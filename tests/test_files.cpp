@@ -1189,8 +1189,9 @@ TEST_SUITE("command line") {
   }
 
   TEST_CASE("terrain: each broken grid is refused with its place") {
-    const std::string head = "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 10\n"
-                             "NODATA_value -9999\n";
+    const std::string head =
+        "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 10\n"
+        "NODATA_value -9999\n";
     const auto error = [](const std::string& t) {
       return messageOf([&] { parseAsc("d.asc", t); });
     };
@@ -1216,7 +1217,8 @@ TEST_SUITE("command line") {
     Folder folder;
     std::string dem = "ncols 9\nnrows 8\nxllcorner 0\nyllcorner 0\ncellsize 10\n";
     for (int j = 0; j < 8; ++j)
-      for (int i = 0; i < 9; ++i) dem += std::to_string((i * i + 3 * j) % 17) + (i < 8 ? " " : "\n");
+      for (int i = 0; i < 9; ++i)
+        dem += std::to_string((i * i + 3 * j) % 17) + (i < 8 ? " " : "\n");
     const std::string in = folder.file("d.asc", dem), out = folder / "d.vtk";
     CHECK(call({"terrain", in, "-o", out}).status == 2);
     CHECK(call({"terrain", in, "-o", out, "--top", "10"}).status == 1);
