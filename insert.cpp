@@ -167,9 +167,9 @@ std::array<int, 4> gridRange(const Parametrization& P, const Parametrization::Gr
 /// `waiting`.
 void fillGrid(Parametrization& P, std::size_t g, const std::vector<int>& triangles,
               std::vector<std::vector<int>>& waiting) {
-  constexpr std::size_t crowded = 16;        // triangles; a vertex may well have 12
-  constexpr double smallestCell = 1e-14;     // in 𝓤, where doubles end
-  constexpr std::size_t fewerBy = 3, of = 4; // a cell that holds nearly all is not cut again
+  constexpr std::size_t crowded = 16;         // triangles; a vertex may well have 12
+  constexpr double smallestCell = 1e-14;      // in 𝓤, where doubles end
+  constexpr std::size_t fewerBy = 3, of = 4;  // a cell that holds nearly all is not cut again
   P.grids[g].first = static_cast<int>(P.gridOf.size());
   const Parametrization::Grid G = P.grids[g];
   std::vector<std::vector<int>> cells(std::size_t(G.size) * G.size);
@@ -2389,8 +2389,8 @@ void checkTerrain(const Terrain& T) {
            std::to_string(T.z.size()) + " heights");
   if (!(T.cell > 0) || !std::isfinite(T.cell)) refuse("the terrain's cell must be above 0");
   for (std::size_t k = 0; k < T.z.size(); ++k) {
-    const std::string where = " at grid point (" + std::to_string(k % T.nx) + ", " +
-                              std::to_string(k / T.nx) + ")";
+    const std::string where =
+        " at grid point (" + std::to_string(k % T.nx) + ", " + std::to_string(k / T.nx) + ")";
     if (!std::isfinite(T.z[k])) refuse("the height" + where + " is not finite");
     if (!(T.z[k] < T.top))
       refuse("the height " + number(T.z[k]) + where + " is not below the top " + number(T.top) +
@@ -2424,7 +2424,7 @@ int piecesOf(const Terrain& T, int i, int j, double allowed) {
 Parametrization terrainPatch(const Terrain& T, double allowed) {
   Parametrization P;
   P.name = "terrain";
-  KeyMap known(T.z.size());  // by position on the grid, in pieces of all sizes; number + 1
+  KeyMap known(T.z.size());    // by position on the grid, in pieces of all sizes; number + 1
   constexpr int common = 840;  // divisible by 1 .. 8
   auto point = [&](int i, int j, int a, int b, int k) {
     const std::uint64_t x = std::uint64_t(i) * common + a * common / k;
@@ -2491,9 +2491,8 @@ struct TerrainBox {
 
 TerrainBox terrainBox(const Terrain& T) {
   const double zLow = *std::min_element(T.z.begin(), T.z.end());
-  return {T,
-          {T.origin.x, T.origin.y, zLow},
-          {T.cell * (T.nx - 1), T.cell * (T.ny - 1), T.top - zLow}};
+  return {
+      T, {T.origin.x, T.origin.y, zLow}, {T.cell * (T.nx - 1), T.cell * (T.ny - 1), T.top - zLow}};
 }
 
 /// A bottom edge or an upright edge of the box, on the ground.
@@ -2574,7 +2573,8 @@ Mesh terrainMesh(const Terrain& T, double allowed) {
 double heightAt(const Terrain& T, double x, double y) {
   const double s = std::clamp((x - T.origin.x) / T.cell, 0., T.nx - 1.);
   const double t = std::clamp((y - T.origin.y) / T.cell, 0., T.ny - 1.);
-  const int i = std::min(static_cast<int>(s), T.nx - 2), j = std::min(static_cast<int>(t), T.ny - 2);
+  const int i = std::min(static_cast<int>(s), T.nx - 2),
+            j = std::min(static_cast<int>(t), T.ny - 2);
   const double a = s - i, b = t - j;
   const double* z = &T.z[j * T.nx + i];
   return (1 - b) * ((1 - a) * z[0] + a * z[1]) + b * ((1 - a) * z[T.nx] + a * z[T.nx + 1]);
@@ -2588,7 +2588,8 @@ std::array<int, 3> terrainCells(const Terrain& T) {
   h = size.z / std::round(size.z / h);
   std::array<int, 3> cells = T.cells;
   for (int a = 0; a < 3; ++a)
-    if (cells[a] == 0) cells[a] = std::max(1, static_cast<int>(std::lround(component(size, a) / h)));
+    if (cells[a] == 0)
+      cells[a] = std::max(1, static_cast<int>(std::lround(component(size, a) / h)));
   return cells;
 }
 
@@ -2705,8 +2706,7 @@ FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBo
       return false;
     }
     d.toSolid = std::max(d.toSolid, Omega.tree.closest(at.onFace, bound * (1 + 1e-9)).distance);
-    d.toFace = std::max(d.toFace,
-                        closestPointOnTriangle(at.onSolid, x[0], x[1], x[2]).distance);
+    d.toFace = std::max(d.toFace, closestPointOnTriangle(at.onSolid, x[0], x[1], x[2]).distance);
     return false;
   });
   return d;
@@ -2880,7 +2880,7 @@ double predictedTets(const Mesh& M, const BoundaryDistance& d, double eps) {
 /// [§2, Algorithm 1, lines 5 to 9] Refines and projects until the distance is at most eps. Returns
 /// the number of passes.
 int refineToDistance(Mesher& W, double eps) {
-  constexpr int mostLevels = 90;  // [choice] 2^30 edges along one of a cube
+  constexpr int mostLevels = 90;             // [choice] 2^30 edges along one of a cube
   constexpr int maxPasses = 3 * mostLevels;  // a bisection need not split the face itself
   Bisection B(W.M);
   for (int pass = 0; pass < maxPasses; ++pass) {
@@ -2888,10 +2888,9 @@ int refineToDistance(Mesher& W, double eps) {
     if (d.largest() <= eps) return pass;
     const double predicted = predictedTets(W.M, d, eps);
     if (predicted > W.options.maxTets)
-      throw InputError("meccanoMesher (§2): eps = " + number(W.options.eps) +
-                       " asks for about " + number(predicted) +
-                       " tetrahedra, above the limit of " + std::to_string(W.options.maxTets) +
-                       "; raise eps or the limit");
+      throw InputError("meccanoMesher (§2): eps = " + number(W.options.eps) + " asks for about " +
+                       number(predicted) + " tetrahedra, above the limit of " +
+                       std::to_string(W.options.maxTets) + "; raise eps or the limit");
     const TriangleList tau = getTrianglesToRefine(W.M, d, eps);
     for (const BoundaryTriangle& t : tau)
       if (W.M.level[t.E] >= mostLevels)
@@ -2901,9 +2900,8 @@ int refineToDistance(Mesher& W, double eps) {
                           ", eps = " + number(W.options.eps) + "; raise eps");
     projectNewNodesToBoundary(W.M, refineTriangles(B, tau));
   }
-  throw MethodError("meccanoMesher (§2): distance(∂M, ∂Ω) is above eps = " +
-                    number(W.options.eps) + " after " + std::to_string(maxPasses) +
-                    " passes; raise eps");
+  throw MethodError("meccanoMesher (§2): distance(∂M, ∂Ω) is above eps = " + number(W.options.eps) +
+                    " after " + std::to_string(maxPasses) + " passes; raise eps");
 }
 
 /// Untangles with the boundary fixed, [departure] and where a few elements stay inverted, bisects
@@ -2976,8 +2974,8 @@ OptimizeReport slideWithin(Mesher& W, double allowed, bool last) {
   return optimizeMesh(M, optimize);
 }
 
-/// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide far,
-/// and what they leave is refined; in the end hardly any face exceeds ε.
+/// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide
+/// far, and what they leave is refined; in the end hardly any face exceeds ε.
 constexpr double guard[] = {3, 1.5, .8, .8, .8, .8};
 
 /// qualityOptimization with ∂Ω prepared.
@@ -3000,9 +2998,9 @@ void optimizeQuality(Mesher& W) {
     const bool last = guard[round - 1] < 1;
     const OptimizeReport o = slideWithin(W, guard[round - 1] * eps, last);
     const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
-    W.progress("round " + std::to_string(round) + ": " + sizeText(W.M) + ", min " +
-               number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " +
-               number(d.largest()) + ", " + std::to_string(o.inverted) + " inverted");
+    W.progress("round " + std::to_string(round) + ": " + sizeText(W.M) + ", min " + number(o.minQ) +
+               ", mean " + number(o.meanQ) + ", distance " + number(d.largest()) + ", " +
+               std::to_string(o.inverted) + " inverted");
     const bool within = d.largest() <= eps;
     if (!within) refineToDistance(W, eps);
     if (!within || o.inverted > 0) {

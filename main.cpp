@@ -3262,12 +3262,13 @@ void runBox(const Arguments& a, const Streams& io) {
 
 /// Table I of a mesh from Algorithm 1, and what it promises.
 void printMesher(const MesherReport& r, const Streams& io) {
-  io.out << tableI({{"refined", &r.refined}, {"untangled", &r.untangled}, {"smoothed", &r.smoothed}})
-         << regularLine(r.regular)
-         << format(
-                "eps %.6g: distance of the mesh's boundary %.6g, of the solid's %.6g; %d bisections "
-                "at most, %d passes, %d rounds of sliding\n",
-                r.eps, r.distance.toSolid, r.distance.toMesh, r.depth, r.passes, r.rounds);
+  io.out
+      << tableI({{"refined", &r.refined}, {"untangled", &r.untangled}, {"smoothed", &r.smoothed}})
+      << regularLine(r.regular)
+      << format(
+             "eps %.6g: distance of the mesh's boundary %.6g, of the solid's %.6g; %d bisections "
+             "at most, %d passes, %d rounds of sliding\n",
+             r.eps, r.distance.toSolid, r.distance.toMesh, r.depth, r.passes, r.rounds);
 }
 
 MesherOptions mesherOptions(const Arguments& a, Progress& progress) {
@@ -3698,14 +3699,16 @@ const std::vector<Command>& commands() {
        runBox},
       {"terrain",
        "DEM.asc",
-       "Makes the tetrahedral mesh between a terrain and a flat top by Algorithm 1, and prints its\n"
+       "Makes the tetrahedral mesh between a terrain and a flat top by Algorithm 1, and prints "
+       "its\n"
        "quality. The terrain is an ESRI ASCII grid (heights in the unit of the cells), bilinear\n"
        "between its points.",
        1,
        1,
        {outputOption,
         {"--top", "Z", "height of the top"},
-        {"--cells", "NX NY NZ", "cubes of the meccano (default: near-cubic, 8 along the longer side)"},
+        {"--cells", "NX NY NZ",
+         "cubes of the meccano (default: near-cubic, 8 along the longer side)"},
         {"--eps", "E", "largest distance from the terrain (default: .002 of the diagonal)"},
         powerOption,
         maxTetsOption,
@@ -3713,8 +3716,10 @@ const std::vector<Command>& commands() {
        runTerrain},
       {"solid",
        "SURFACE",
-       "Makes the tetrahedral mesh of the solid inside a closed surface by Algorithm 1, and prints\n"
-       "its quality. Without a polycube the meccano is a box of cubes, for solids without handles.\n"
+       "Makes the tetrahedral mesh of the solid inside a closed surface by Algorithm 1, and "
+       "prints\n"
+       "its quality. Without a polycube the meccano is a box of cubes, for solids without "
+       "handles.\n"
        "A polycube file has a line `cube i j k` for each cube, and `corner i j k  x y z` for each\n"
        "corner of their union: the point of the solid where it goes.",
        1,

@@ -215,7 +215,7 @@ struct OptimizeOptions {
   std::vector<int> active = {};  // nodes visited in the first sweep; empty: all
   // [§2 choice] δ from each star's own σ, for meshes whose σ spans orders of magnitude
   bool starDelta = false;
-  // [§2 choice] asked before a sliding node n moves to x at this parameter; false: it stays
+  // asked before a sliding node n moves to x at this parameter; false: it stays. Only reads M.
   std::function<bool(int n, Vec3 x, Vec2 parameter)> accept = nullptr;
   std::function<void(const Sweep&)> onSweep = nullptr;  // called after each sweep
 
@@ -417,11 +417,11 @@ std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
 
 /// A terrain: heights on a regular grid, bilinear between its points, under a flat top.
 struct Terrain {
-  int nx = 0, ny = 0;     // grid points along x and along y, >= 2
-  Vec2 origin;            // of the point (0, 0), the south-west one
-  double cell = 0;        // distance of neighbouring grid points, length unit of z; > 0
-  std::vector<double> z;  // [nx * ny], height of point (i, j) in z[j * nx + i]
-  double top = 0;         // height of the flat top, above all z
+  int nx = 0, ny = 0;                 // grid points along x and along y, >= 2
+  Vec2 origin;                        // of the point (0, 0), the south-west one
+  double cell = 0;                    // distance of neighbouring grid points, length unit of z; > 0
+  std::vector<double> z;              // [nx * ny], height of point (i, j) in z[j * nx + i]
+  double top = 0;                     // height of the flat top, above all z
   std::array<int, 3> cells{0, 0, 0};  // cubes of the meccano along each axis; 0: near-cubic ones
   std::string name = {};
 };
@@ -452,13 +452,13 @@ struct BoundaryDistance {
 };
 
 struct MesherReport {
-  double eps = 0;                  // as used
-  BoundaryDistance distance;       // of the final mesh, at most eps
-  int depth = 0;                   // bisections since the cube, the most of all tetrahedra
-  int passes = 0;                  // of lines 5 to 9, before the optimization
-  int rounds = 0;                  // of qualityOptimization in which the boundary slid
+  double eps = 0;             // as used
+  BoundaryDistance distance;  // of the final mesh, at most eps
+  int depth = 0;              // bisections since the cube, the most of all tetrahedra
+  int passes = 0;             // of lines 5 to 9, before the optimization
+  int rounds = 0;             // of qualityOptimization in which the boundary slid
   QualityStatistics refined, untangled, smoothed;  // against the computational elements
-  QualityStatistics regular;       // smoothed, against the regular tetrahedron
+  QualityStatistics regular;                       // smoothed, against the regular tetrahedron
   std::vector<std::string> warnings;
 };
 

@@ -629,7 +629,8 @@ bool staysUnfolded(Smoother& S, int n, Vec2 parameter) {
 /// of 1e-8 by truncation and by cancellation.
 constexpr double differenceStep = 1e-4;
 
-constexpr int rejectedSteps = 3;  // OptimizeOptions::accept is asked for so many, each half the last
+constexpr int rejectedSteps =
+    3;  // OptimizeOptions::accept is asked for so many, each half the last
 
 /// [§3.7.3, eq. (10), (11)] A surface or curve node: a Newton step in its parameters. Returns the
 /// displacement.

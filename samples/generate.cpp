@@ -19,7 +19,8 @@ using meccano::Vec3;
 namespace samples = meccano::samples;
 
 constexpr const char* help =
-    "usage: generate DIR                                    writes DIR/cube_sine, /faults, /layers\n"
+    "usage: generate DIR                                    writes DIR/cube_sine, /faults, "
+    "/layers\n"
     "       generate --surface NAME [ARGS] FILE.obj         writes one surface\n"
     "       generate --island N FILE.asc                    a synthetic island of N x N heights\n"
     "       generate --layer DEM.asc HEIGHT MARGIN SMOOTH FILE.obj\n"
@@ -181,9 +182,9 @@ int main(int argc, char** argv) {
     } else if (args.size() == 6 && args[0] == "--layer") {
       const meccano::Terrain T = meccano::app::readTerrain(args[1]);
       const int times = static_cast<int>(argument(args, 4, 0));
-      writeObj(samples::layer(samples::smoothed(T, times), argument(args, 2, 0),
-                              argument(args, 3, 0)),
-               args[5]);
+      writeObj(
+          samples::layer(samples::smoothed(T, times), argument(args, 2, 0), argument(args, 3, 0)),
+          args[5]);
     } else if (args.size() == 1 && args[0][0] != '-') {
       std::filesystem::create_directories(args[0] + "/cube_sine");
       writeSineSample(args[0] + "/cube_sine/sine.obj");

@@ -371,8 +371,8 @@ inline Terrain island(int n) {
         const double d = (x - u) * (x - u) + (y - v) * (y - v);
         return 260 * (std::exp(-d / .0025) - 1.2 * std::exp(-d / .0005));
       };
-      const double z = cone * ridges + std::min(1., cone / 300) * (waves + crater(.17, .05) +
-                                                                    crater(-.1, -.16));
+      const double z =
+          cone * ridges + std::min(1., cone / 300) * (waves + crater(.17, .05) + crater(-.1, -.16));
       T.z.push_back(std::round(std::max(0., z)));
     }
   return T;

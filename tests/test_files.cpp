@@ -1177,4 +1177,81 @@ TEST_SUITE("command line") {
     CHECK(has(o.out, "5 nodes, 2 tetrahedra"));
     CHECK(has(o.out, format("%-12s%14d", "inverted", 1)));
   }
+
+  TEST_CASE("terrain: an ESRI ASCII grid, rows from the north, keys in any case and order") {
+    const std::string text =
+        "CELLSIZE 10\nnrows 2\nXLLCENTER 5\nncols 3\nyllcorner 100\nNODATA_value -9999\n"
+        "1 2 3\n4 5 6.5\n";
+    const Terrain T = parseAsc("dem.asc", text);
+    CHECK(T.nx == 3);
+    CHECK(T.ny == 2);
+    CHECK(T.origin.x == 5);
+    CHECK(T.origin.y == 105);
+    CHECK(T.z == std::vector<double>{4, 5, 6.5, 1, 2, 3});
+    CHECK(heightAt(T, 15, 110) == 3.5);
+  }
+
+  TEST_CASE("terrain: each broken grid is refused with its place") {
+    const std::string head =
+        "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 10\n"
+        "NODATA_value -9999\n";
+    const auto error = [](const std::string& t) {
+      return messageOf([&] { parseAsc("d.asc", t); });
+    };
+    CHECK(has(error(""), "d.asc: the file is empty"));
+    CHECK(has(error(head + "1 2 3\n4 -9999 6\n"), "d.asc:8: row 2, column 2: no data"));
+    CHECK(has(error(head + "1 2 3\n4 x 6\n"), "d.asc:8: row 2, column 2: 'x' is no number"));
+    CHECK(has(error(head + "1 2\n4 5 6\n"), "d.asc:7: row 1 has 2 heights, ncols promises 3"));
+    CHECK(has(error(head + "1 2 3 4\n5 6\n"), "row 1 has 4 heights"));
+    CHECK(has(error(head + "1 2 3 4 5 6\n"), "row 1 has 6 heights"));
+    CHECK(has(error(head + "111111 222222 333333\n"), "ends after 1 rows"));
+    CHECK(has(error(head + "1 2 3\n4 5 6\n7 8 9\n"), "more than the 2 rows"));
+    CHECK(has(error("ncols 3\ncolour 2\n"), "d.asc:2: 'colour' is no key"));
+    CHECK(has(error("ncols 3\nnrows 2\ncellsize 10\n1 2 3\n4 5 6\n"), "xllcorner is missing"));
+    CHECK(has(error("ncols 3\nncols 3\n"), "given twice"));
+    CHECK(has(error("ncols 1\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n2\n"),
+              "ncols = 1 must be"));
+    CHECK(has(error("ncols 2\nnrows 2\nxllcorner -15.5\nyllcorner 28\ncellsize .001\n"
+                    "100 200\n300 400\n"),
+              "looks like degrees"));
+  }
+
+  TEST_CASE("terrain: the command writes a mesh that reads back, and refuses wrong usage") {
+    Folder folder;
+    std::string dem = "ncols 9\nnrows 8\nxllcorner 0\nyllcorner 0\ncellsize 10\n";
+    for (int j = 0; j < 8; ++j)
+      for (int i = 0; i < 9; ++i)
+        dem += std::to_string((i * i + 3 * j) % 17) + (i < 8 ? " " : "\n");
+    const std::string in = folder.file("d.asc", dem), out = folder / "d.vtk";
+    CHECK(call({"terrain", in, "-o", out}).status == 2);
+    CHECK(call({"terrain", in, "-o", out, "--top", "10"}).status == 1);
+    CHECK(call({"terrain", in, "-o", out, "--top", "60", "--eps", "0"}).status == 2);
+    CHECK(!fs::exists(out));
+    const Outcome o = call({"terrain", in, "-o", out, "--top", "60", "--cells", "4", "4", "3"});
+    REQUIRE_MESSAGE(o.status == 0, o.err);
+    CHECK(has(o.err, "4 x 4 x 3 cells, eps "));
+    CHECK(has(o.out, "smoothed"));
+    const Mesh M = readMesh(out);
+    CHECK(qualityStatistics(M).inverted == 0);
+    CHECK(vtkText(M) == readFile(out));
+  }
+
+  TEST_CASE("solid: polycube files, and each broken line is refused with its place") {
+    const Meccano D =
+        parsePolycube("p", "# two\ncube 0 0 0\ncube -1 0 0\ncorner 0 1 2  1.5 -2 3e1 # there\n");
+    CHECK(D.cubes == std::vector<std::array<int, 3>>{{0, 0, 0}, {-1, 0, 0}});
+    REQUIRE(D.corners.size() == 1);
+    CHECK(D.corners[0].at == std::array<int, 3>{0, 1, 2});
+    CHECK(D.corners[0].x == Vec3{1.5, -2, 30});
+    const auto error = [](const std::string& t) {
+      return messageOf([&] { parsePolycube("p.txt", t); });
+    };
+    CHECK(has(error(""), "no `cube i j k` line"));
+    CHECK(has(error("cube 0 0 0\ncube 0 0 0\n"), "p.txt:2: this cube is given twice"));
+    CHECK(has(error("cube 0 0\n"), "p.txt:1: a cube is `cube i j k`, here are 2 numbers"));
+    CHECK(has(error("cube 0 0 .5\n"), "'.5' is no integer"));
+    CHECK(has(error("corner 0 0 0 1 2\n"), "a corner is `corner i j k  x y z`"));
+    CHECK(has(error("corner 0 0 0 1 2 nan\n"), "'nan' is no coordinate"));
+    CHECK(has(error("kube 0 0 0\n"), "'kube' is no line of a polycube"));
+  }
 }

@@ -1,0 +1,249 @@
+// SPDX-License-Identifier: MIT
+//
+// §2: Algorithm 1 on terrain and on solids. Distances are measured here anew, without the mesher's.
+#include <doctest/doctest.h>
+
+#include "../samples/surfaces.hpp"
+#include "shapes.hpp"
+#include "solids.hpp"
+
+using namespace meccano;
+
+namespace {
+
+/// The boundary faces of a mesh, all or of one patch.
+std::vector<std::array<int, 3>> boundaryOf(const Mesh& M) {
+  std::vector<std::array<int, 3>> all;
+  for (std::size_t p = 1; p <= M.patches.size(); ++p)
+    for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) all.push_back(face);
+  return all;
+}
+
+/// The largest distance of points sampled on the triangles from the surface, by brute force over
+/// the nearest by a tree of the library, re-measured by the tests' own distance.
+double sampledDistance(const std::vector<Vec3>& x, const std::vector<std::array<int, 3>>& faces,
+                       const TriangleSurface& S, int steps) {
+  const TriangleTree tree(S.points, S.triangles);
+  double most = 0;
+  for (const auto& f : faces)
+    for (int a = 0; a <= steps; ++a)
+      for (int b = 0; a + b <= steps; ++b) {
+        const double s = double(a) / steps, t = double(b) / steps;
+        const Vec3 p = s * x[f[0]] + t * x[f[1]] + (1 - s - t) * x[f[2]];
+        const std::array<int, 3> v = S.triangles[tree.closest(p).triangle];
+        most = std::max(
+            most, shapes::distanceToTriangle(p, S.points[v[0]], S.points[v[1]], S.points[v[2]]));
+      }
+  return most;
+}
+
+MesherOptions withEps(double eps) {
+  MesherOptions options;
+  options.eps = eps;
+  return options;
+}
+
+/// A hill of a smooth formula, 24 x 20 points of 50 m, not symmetric.
+Terrain hill() {
+  Terrain T;
+  T.nx = 24, T.ny = 20, T.cell = 50, T.origin = {300, -200}, T.top = 900;
+  for (int j = 0; j < T.ny; ++j)
+    for (int i = 0; i < T.nx; ++i)
+      T.z.push_back(200 * std::exp(-.02 * ((i - 9) * (i - 9) + (j - 12) * (j - 12))) + 2 * i);
+  T.cells = {4, 3, 3};
+  return T;
+}
+
+template <class F>
+std::string messageOf(F f) {
+  try {
+    f();
+  } catch (const Error& e) {
+    return e.what();
+  }
+  return "";
+}
+
+bool has(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
+
+}  // namespace
+
+TEST_SUITE("2") {
+  TEST_CASE("Algorithm 1: a terrain box is valid, its bottom within eps of the bilinear heights") {
+    const Terrain T = hill();
+    Mesh M;
+    const MesherReport r = meccanoMesher(M, T, withEps(4));
+    CHECK(shapes::countInverted(M) == 0);
+    CHECK(shapes::conformityFault(M) == "");
+    CHECK(r.smoothed.min > .5);
+    CHECK(r.distance.largest() <= 4);
+    // upright distances bound the nearest ones: of the mesh from the terrain, and the other way
+    const auto bottom = surfaceFaces(M, -5);
+    double worst = 0;
+    for (const auto& f : bottom)
+      for (int a = 0; a <= 8; ++a)
+        for (int b = 0; a + b <= 8; ++b) {
+          const Vec3 p =
+              (a / 8.) * M.x[f[0]] + (b / 8.) * M.x[f[1]] + ((8 - a - b) / 8.) * M.x[f[2]];
+          worst = std::max(worst, std::abs(p.z - heightAt(T, p.x, p.y)));
+        }
+    CHECK(worst <= 4 * 1.2);  // upright on slopes up to 35 degrees
+    TriangleSurface S;
+    S.points = M.x, S.triangles = bottom;
+    TriangleSurface fine;
+    constexpr int n = 60;
+    for (int j = 0; j <= n; ++j)
+      for (int i = 0; i <= n; ++i) {
+        const double x = 300 + 1150. * i / n, y = -200 + 950. * j / n;
+        fine.points.push_back({x, y, heightAt(T, x, y)});
+        if (i > 0 && j > 0) {
+          const int k = j * (n + 1) + i;
+          fine.triangles.push_back({k - n - 2, k - n - 1, k});
+          fine.triangles.push_back({k - n - 2, k, k - 1});
+        }
+      }
+    CHECK(sampledDistance(fine.points, fine.triangles, S, 1) <= 4);
+  }
+
+  TEST_CASE("Algorithm 1: the sides of a terrain box stay in their planes, the top flat") {
+    Mesh M;
+    const Terrain T = hill();
+    meccanoMesher(M, T, withEps(8));
+    const double plane[6] = {300, 300 + 23 * 50., -200, -200 + 19 * 50., 0, 900};
+    for (int p = 1; p <= 6; ++p) {
+      CAPTURE(p);
+      double worst = 0;
+      for (const auto& f : surfaceFaces(M, -p))
+        for (int n : f) {
+          const double at[3] = {M.x[n].x, M.x[n].y, M.x[n].z};
+          if (p != 5) worst = std::max(worst, std::abs(at[(p - 1) / 2] - plane[p - 1]));
+          if (p == 5) worst = std::max(worst, std::abs(at[2] - heightAt(T, at[0], at[1])) - .8);
+        }
+      CHECK(worst < 1e-9);
+    }
+  }
+
+  TEST_CASE("distance: that of a coarse mesh is what it is, and falls as eps is lowered") {
+    Mesh coarse, fine;
+    const MesherReport a = meccanoMesher(coarse, hill(), withEps(30));
+    const MesherReport b = meccanoMesher(fine, hill(), withEps(3));
+    CHECK(a.distance.largest() <= 30);
+    CHECK(b.distance.largest() <= 3);
+    CHECK(a.distance.largest() > 3);
+    CHECK(fine.tets.size() > 2 * coarse.tets.size());
+    CHECK(b.depth > a.depth);
+    CHECK(b.depth < 30);
+    CHECK(distance(coarse).largest() == doctest::Approx(a.distance.largest()));
+    // a node of the bottom pulled away is found
+    Mesh pulled = coarse;
+    for (std::size_t n = 0; n < pulled.x.size(); ++n)
+      if (pulled.dimension[n] == 2 && pulled.entity[n] == -5) {
+        pulled.x[n].z += 200;
+        break;
+      }
+    CHECK(distance(pulled).largest() > 60);
+  }
+
+  TEST_CASE("getTrianglesToRefine, refineTriangles: exactly the far triangles, conforming, on Pi") {
+    Mesh M;
+    meccanoMesher(M, hill(), withEps(60));
+    const BoundaryDistance d = distance(M);
+    const TriangleList tau = getTrianglesToRefine(M, d, .5 * d.largest());
+    REQUIRE(!tau.empty());
+    for (const BoundaryTriangle& t : tau) CHECK(d.ofFace[t.E][t.i] > .5 * d.largest());
+    const std::size_t nodes = M.x.size();
+    Bisection B(M);
+    const TriangleList tauNew = refineTriangles(B, tau);
+    projectNewNodesToBoundary(M, tauNew);
+    CHECK(M.x.size() > nodes);
+    CHECK(shapes::conformityFault(M) == "");
+    const Terrain T = hill();
+    for (std::size_t n = nodes; n < M.x.size(); ++n)
+      if (M.dimension[n] == 2 && M.entity[n] == -5)
+        CHECK(std::abs(M.x[n].z - heightAt(T, M.x[n].x, M.x[n].y)) < 6);
+    CHECK(getTrianglesToRefine(M, d, 2 * d.largest()).empty());
+  }
+
+  TEST_CASE("Algorithm 1: a sphere, both distances within eps, sliding lifts the quality") {
+    const TriangleSurface S = solids::sphere(12);
+    const double eps = .03;
+    Mesh M, fixed;
+    const MesherReport r = meccanoMesher(M, S, withEps(eps));
+    MesherOptions options = withEps(eps);
+    options.fixedBoundary = true;
+    const MesherReport f = meccanoMesher(fixed, S, options);
+    for (const Mesh* m : {&M, &fixed}) {
+      CHECK(shapes::countInverted(*m) == 0);
+      CHECK(shapes::conformityFault(*m) == "");
+      const auto faces = boundaryOf(*m);
+      TriangleSurface own;
+      own.points = m->x, own.triangles = faces;
+      CHECK(sampledDistance(m->x, faces, S, 6) <= eps);
+      CHECK(sampledDistance(S.points, S.triangles, own, 4) <= eps);
+    }
+    CHECK(r.smoothed.min >= .5);
+    CHECK(r.smoothed.mean >= f.smoothed.mean);
+    CHECK(f.rounds == 0);
+    CHECK(r.depth < 40);
+    Mesh again;
+    meccanoMesher(again, S, withEps(eps));
+    CHECK(shapes::sameMesh(M, again));
+  }
+
+  TEST_CASE(
+      "Algorithm 1: a surface is inserted into a solid, boundary nodes stay on their patches") {
+    Mesh M;
+    meccanoMesher(M, solids::sphere(8), withEps(.1));
+    InsertOptions options;
+    options.lc = .3;
+    TriangleSurface S = samples::sheet(20, 20, [](double s, double t) {
+      return Vec3{.35 * s, .35 * t, .1 * s * t};
+    });
+    const InsertReport r = insertSurface(M, S, options);
+    CHECK(r.smoothed.inverted == 0);
+    CHECK(shapes::countInverted(M) == 0);
+    double worst = 0;
+    for (std::size_t n = 0; n < M.x.size(); ++n)
+      if (M.dimension[n] == 2 && M.entity[n] < 0)
+        worst = std::max(worst, norm(M.x[n] - varphi(surfaceOf(M, M.entity[n]), M.parameter[n])));
+    CHECK(worst < 1e-12);
+  }
+
+  TEST_CASE("meccanoMesher: what is refused, and the mesh then unchanged") {
+    Mesh M = shapes::kuhnCube();
+    const Mesh before = M;
+    const auto refusal = [&](Terrain T, MesherOptions options) {
+      return messageOf([&] { meccanoMesher(M, T, options); });
+    };
+    for (double eps : {0., -1., std::numeric_limits<double>::infinity()})
+      CHECK(has(refusal(hill(), withEps(eps)), "must be above 0"));
+    MesherOptions few = withEps(.5);
+    few.maxTets = 2000;
+    CHECK(has(refusal(hill(), few), "above the limit of 2000; raise eps or the limit"));
+    Terrain high = hill();
+    high.top = 150;
+    CHECK(has(refusal(high, withEps(4)), "is not below the top 150; raise the top"));
+    Terrain broken = hill();
+    broken.z[7] = std::numeric_limits<double>::quiet_NaN();
+    CHECK(has(refusal(broken, withEps(4)), "at grid point (7, 0) is not finite"));
+    broken.z.pop_back();
+    CHECK(has(refusal(broken, withEps(4)), "a height for each"));
+    CHECK(shapes::sameMesh(M, before));
+  }
+
+  TEST_CASE("heightAt, terrainCells, terrainEps: bilinear, near-cubic, 1/500 of the diagonal") {
+    Terrain T = hill();
+    CHECK(heightAt(T, 300 + 50 * 3, -200 + 50 * 4) == doctest::Approx(T.z[4 * 24 + 3]));
+    const double middle = .25 * (T.z[0] + T.z[1] + T.z[24] + T.z[25]);
+    CHECK(heightAt(T, 325, -175) == doctest::Approx(middle));
+    T.cells = {0, 0, 0};
+    const std::array<int, 3> n = terrainCells(T);
+    const double hx = 1150. / n[0], hy = 950. / n[1];
+    CHECK(n[0] == 8);
+    CHECK(std::abs(hx / hy - 1) < .2);
+    CHECK(terrainEps(T) > 2);
+    CHECK(terrainEps(T) < 4);
+  }
+}
