@@ -345,9 +345,9 @@ struct Balance {
 /// one reaction is decay of first order.
 struct Transport {
   const Domain& D;
-  const Field& F;  // fluxes of the wind
+  Field F;  // fluxes of the wind
   double dt;
-  const Settings& s;
+  Settings s;
   std::vector<char> fixed;  // [nodes], 1 clean inflow, 2 source
   Field value;              // there
   Field m, mTerrain;        // ∫ N_i over the volume, over the terrain
