@@ -287,7 +287,6 @@ TEST_SUITE("4.3.2") {
     const Transport P(D, W, source, 1, s);
     for (std::size_t E = 0; E < D.tets.size(); ++E)
       for (int i = 0; i < 4; ++i) {
-        Vec3 middle;
         double c = 0;
         bool side = true;
         for (int j = 0; j < 4; ++j)

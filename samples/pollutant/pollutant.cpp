@@ -231,9 +231,9 @@ Field fluxes(const Domain& D, const std::vector<Vec3>& u) {
   return F;
 }
 
-/// The u = u0 + T∇φ nearest to u0 with ∫ u·∇w = 0 for every w that vanishes, like
-/// phi, on the sides and the top: ∫ T∇φ·∇w = -∫ u0·∇w. The terrain is
-/// impermeable by itself, for w does not vanish there: ∫ u·∇w = ∮ w u·n.
+/// The u = u0 + T∇φ nearest to u0 with ∫ u·∇w = 0 for every w that vanishes, like φ, on the sides
+/// and the top: ∫ T∇φ·∇w = −∫ u0·∇w. The terrain is impermeable by itself, for w does not vanish
+/// there: ∫ u·∇w = ∮ w u·n.
 Wind massConsistentWind(const Domain& D, const std::vector<Vec3>& u0, double ah, double av) {
   constexpr double tolerance = 1e-10;  // the transported mass is kept to this, so below the 1e-8
   constexpr int fill = 5;  // density type: 67 iterations, not 106; the transport gains nothing
@@ -345,9 +345,9 @@ struct Balance {
 /// one reaction is decay of first order.
 struct Transport {
   const Domain& D;
-  const Field& F;  // fluxes of the wind
+  Field F;  // fluxes of the wind
   double dt;
-  const Settings& s;
+  Settings s;
   std::vector<char> fixed;  // [nodes], 1 clean inflow, 2 source
   Field value;              // there
   Field m, mTerrain;        // ∫ N_i over the volume, over the terrain
