@@ -4621,7 +4621,8 @@ double uncovered(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S
   return weight * sum / area;
 }
 
-/// Where S has no square beside it because another surface is in the way: the place; empty: nowhere.
+/// Where S has no square beside it because another surface is in the way: the place; empty:
+/// nowhere.
 std::string blockedPlace(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
                          const Survey& survey, int side, const Selection& selected) {
   constexpr double missed = 2;  // [choice] of h from S to S_M: at the rim one square may be missing
@@ -5932,7 +5933,7 @@ constexpr double poorHausdorff = .3, poorWorth = .6;
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
   constexpr double badHausdorff = .5;  // [choice] of l_c: refused
-  constexpr double poorShift = 2;                          // [choice] of h: warned of
+  constexpr double poorShift = 2;      // [choice] of h: warned of
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
                       number(report.hausdorff) +
@@ -6002,8 +6003,7 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   const double good = I.M.tets.size() < large ? goodQuality : goodLargeQuality;
   auto isGood = [&] {
     return report.surface > 0 &&
-           (I.lowest >= std::min(good, report.original.min) ||
-            I.options.outline == Outline::paper);
+           (I.lowest >= std::min(good, report.original.min) || I.options.outline == Outline::paper);
   };
   std::vector<Outline> outlines{I.options.outline};
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
@@ -6092,7 +6092,8 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
   }
 }
 
-/// The earlier surface nearest to S, for messages: "'name', 12.5 away at triangle 3 near (1, 2, 3)".
+/// The earlier surface nearest to S, for messages: "'name', 12.5 away at triangle 3 near (1, 2,
+/// 3)".
 struct Nearest {
   std::string text;
   double distance;
@@ -6102,9 +6103,9 @@ Nearest nearestEarlier(const Mesh& M, const SurfaceDistance& S) {
   for (std::size_t k = 0; k < M.surfaces.size(); ++k) {
     const Gap gap = smallestGap(S.tree, M.surfaces[k].points, M.surfaces[k].triangles);
     if (gap.distance < nearest.distance)
-      nearest = {labelOf(M.surfaces[k].name, k + 1) + " is " + number(gap.distance) + " away" +
-                     at(gap),
-                 gap.distance};
+      nearest = {
+          labelOf(M.surfaces[k].name, k + 1) + " is " + number(gap.distance) + " away" + at(gap),
+          gap.distance};
   }
   return nearest;
 }
@@ -6143,14 +6144,14 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
     throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
                       " nor down to " + number(2 * lc) + ", after " + std::to_string(I.faults) +
                       " tries, the last because " + I.reason +
-                      (nearest.distance < options.lc ? "; " + nearest.text + ": lower l_c to " +
-                                                           number(.5 * nearest.distance)
-                                                     : "; lower l_c"));
+                      (nearest.distance < options.lc
+                           ? "; " + nearest.text + ": lower l_c to " + number(.5 * nearest.distance)
+                           : "; lower l_c"));
   std::vector<std::string> warnings = candidate.warnings;
   if (report.lc < options.lc)
-    warnings.push_back("l_c was lowered from " + number(options.lc) + " to " + number(report.lc) +
-                       ", because " +
-                       (wasBlocked ? nearest.text : "at " + number(options.lc) + " no way was valid"));
+    warnings.push_back(
+        "l_c was lowered from " + number(options.lc) + " to " + number(report.lc) + ", because " +
+        (wasBlocked ? nearest.text : "at " + number(options.lc) + " no way was valid"));
   report.warnings.insert(report.warnings.begin(), warnings.begin(), warnings.end());
   report.regular = qualityStatistics(result, Ideal::regular);
   I.stage("smoothed", result);

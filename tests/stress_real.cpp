@@ -50,7 +50,7 @@ struct Row {
   Order order = Order::asListed;
   bool slow = false;    // run only where named
   bool sample = false;  // the files are the project's own, of the box of samples/faults
-  bool valid = true;  // false: either outcome will do
+  bool valid = true;    // false: either outcome will do
 };
 
 std::vector<Row> rows() {
@@ -140,8 +140,8 @@ Mesh boxAround(const std::vector<TriangleSurface>& surfaces, Row& row) {
   const double margin =
       row.marginOfDiagonal > 0 ? row.marginOfDiagonal * diagonal : row.marginOfLc * row.lc;
   const Vec3 extent = hi - lo + 2 * margin * Vec3{1, 1, 1};
-  const double edge = row.lc > 0 ? 8 * .98 * row.lc / std::sqrt(3.)
-                                 : std::max({extent.x, extent.y, extent.z}) / 6;
+  const double edge =
+      row.lc > 0 ? 8 * .98 * row.lc / std::sqrt(3.) : std::max({extent.x, extent.y, extent.z}) / 6;
   const std::array<int, 3> cells{static_cast<int>(std::ceil(extent.x / edge)),
                                  static_cast<int>(std::ceil(extent.y / edge)),
                                  static_cast<int>(std::ceil(extent.z / edge))};
@@ -183,10 +183,11 @@ std::string resultLine(const Mesh& M, const std::vector<InsertReport>& reports) 
     least = std::min(least, r.lc);
   }
   const QualityStatistics& q = reports.back().smoothed;
-  return format("%d surfaces, %7d tets, inverted %d, min %.3f mean %.3f, l_c from %.4g, H/lc %.2f, "
-                "shift/h %.2f",
-                static_cast<int>(reports.size()), q.tetrahedra, q.inverted, q.min, q.mean, least,
-                hausdorff, shift);
+  return format(
+      "%d surfaces, %7d tets, inverted %d, min %.3f mean %.3f, l_c from %.4g, H/lc %.2f, "
+      "shift/h %.2f",
+      static_cast<int>(reports.size()), q.tetrahedra, q.inverted, q.min, q.mean, least, hausdorff,
+      shift);
 }
 
 struct Arguments {
