@@ -3085,7 +3085,7 @@ MesherReport meccanoMesher(Mesh& M, const Terrain& Omega, const MesherOptions& o
   checkTerrain(Omega);
   checkOptions(options);
   const double allowed = bilinearPart * options.eps, missed = terrainDeviation(Omega, allowed);
-  if (missed > 2 * allowed)
+  if (missed > .5 * options.eps)
     throw InputError("meccanoMesher (§2): eps = " + number(options.eps) +
                      " is too small for the terrain's grid, whose cells are twisted by " +
                      number(missed) + "; raise eps or refine the grid");
