@@ -6289,23 +6289,13 @@ std::string advice(const Insertion& I, const Mesh& M, double largest, double lc)
   return "lower l_c";
 }
 
-/// Whether this mesh ends the search: valid, and within the tolerance where one is wanted; where
-/// l_c is chosen, S_M no farther from S than is warned of.
-bool isEnough(const InsertReport& report, const InsertOptions& options) {
-  if (report.surface == 0) return false;
-  if (options.tolerance > 0) return report.hausdorff <= options.tolerance;
-  return options.lc > 0 || report.hausdorff <= poorHausdorff * report.lc;
-}
-
-/// The search for l_c: the first of the sizes whose mesh is enough; where l_c is chosen and none
-/// is, the first valid one. A size after the first that asks for too many tetrahedra ends it.
+/// The search for l_c: the first of the sizes with a valid mesh, within the tolerance where one is
+/// wanted. A size after the first that asks for too many tetrahedra ends it.
 void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, Mesh& result,
                 InsertReport& report) {
   constexpr int maxTries = 2;  // [choice] of a given l_c, with ways that were followed to the end
   const double E = I.options.tolerance;
   const InsertReport start = report;
-  Mesh firstMesh;
-  InsertReport first;
   double last = sizes[0], nearest = beyondAll;
   int tries = 0;
   for (std::size_t i = 0; i < sizes.size() && (I.options.lc == 0 || tries < maxTries); ++i) {
@@ -6316,12 +6306,11 @@ void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, M
       last = sizes[i];
       report = start;
       insertWithSize(I, M, last, result, report);
-      if (isEnough(report, I.options)) return;
+      if (report.surface > 0 && (E == 0 || report.hausdorff <= E)) return;
       if (report.surface > 0) {
         I.leave("l_c = " + number(last),
                 MethodError("the Hausdorff distance S_M - S is " + number(report.hausdorff)));
         nearest = std::min(nearest, report.hausdorff);
-        if (first.surface == 0) first = report, firstMesh = std::move(result);
       }
     } catch (const MethodError& error) {
       I.leave("l_c = " + number(last), error);
@@ -6332,10 +6321,6 @@ void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, M
     }
     I.wasBlocked = I.wasBlocked || I.isBlocked;
     if (I.ways > waysBefore || !I.isBlocked) ++tries;
-  }
-  if (first.surface > 0 && E == 0) {
-    report = first, result = std::move(firstMesh);
-    return;
   }
   if (nearest < beyondAll)
     throw MethodError("insertSurface (§3.2): no mesh within the tolerance " + number(E) +
