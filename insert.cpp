@@ -3411,9 +3411,6 @@ void checkClosed(CleanSurface& C, std::vector<std::string>& warnings) {
   for (std::array<int, 3>& t : S.triangles) std::swap(t[1], t[2]);
 }
 
-/// Triangles without a common point that cross, and the place of the first.
-int crossingTriangles(const TriangleSurface& S, Vec3& where);
-
 }  // namespace
 
 TriangleSurface checkSolid(const TriangleSurface& D, std::vector<std::string>& warnings) {
@@ -3425,11 +3422,12 @@ TriangleSurface checkSolid(const TriangleSurface& D, std::vector<std::string>& w
                                         : "the surface is empty: all its triangles have zero area; "
                                           "check its coordinates");
     checkClosed(C, warnings);
-    Vec3 where;
-    if (const int pairs = crossingTriangles(C.S, where); pairs > 0)
-      warnings.push_back("§2: the surface crosses itself: " + counted(pairs, "pair") +
-                         " of triangles, the first at " + placeText(where) +
-                         "; the mesh may overlap there");
+    const std::vector<Crossing> crossings = selfCrossings(C.S);
+    if (!crossings.empty())
+      warnings.push_back(
+          "§2: the surface crosses itself: " + counted(static_cast<int>(crossings.size()), "pair") +
+          " of triangles, the first at " + placeText(crossings[0].point) +
+          "; the mesh may overlap there");
     return C.S;
   } catch (const InputError& e) {  // the tools of §3.1 speak of an insertion
     const std::string text = e.what(), prefix = "insertSurface (§3.1): ";
@@ -3690,40 +3688,47 @@ double trianglesDistance(const std::array<Vec3, 3>& A, const std::array<Vec3, 3>
   return best;
 }
 
-/// Largest distance of points of A, a lattice of m steps on each triangle, from B.
-double sampledDistance(const TriangleTree& A, const TriangleTree& B, int m) {
+std::array<Vec3, 3> cornersOf(const TriangleSurface& S, int t) {
+  const std::array<int, 3>& v = S.triangles[t];
+  return {S.points[v[0]], S.points[v[1]], S.points[v[2]]};
+}
+
+double areaOf(const TriangleSurface& S, int t) {
+  const std::array<Vec3, 3> c = cornersOf(S, t);
+  return .5 * norm(cross(c[1] - c[0], c[2] - c[0]));
+}
+
+/// Whether two triangles cross or touch beyond what they share: an edge of one, without a point of
+/// the other, meets the other. Those with a common edge do not.
+bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
+  const std::array<int, 3>&T = S.triangles[t], &U = S.triangles[s];
+  const auto isShared = [](const std::array<int, 3>& v, int n) { return cornerAt(v, n) < 3; };
+  if (isShared(U, T[0]) + isShared(U, T[1]) + isShared(U, T[2]) > 1) return false;
+  for (int i = 0; i < 3; ++i)
+    for (const auto& [A, B, b] : {std::tuple(T, U, s), std::tuple(U, T, t)}) {
+      const int m = A[i], n = A[(i + 1) % 3];
+      if (!isShared(B, m) && !isShared(B, n) &&
+          segmentCrosses(S.points[m], S.points[n], cornersOf(S, b), at))
+        return true;
+    }
+  return false;
+}
+
+/// Largest distance of points of A, a lattice of `least` steps on each triangle or of more that are
+/// no longer than `spacing`, from B.
+double sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing) {
+  constexpr double mostSteps = 1000;
   double largest = 0;
-  for (const std::array<Vec3, 3>& c : A.corners)
+  for (const std::array<Vec3, 3>& c : A.corners) {
+    const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
+    const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
     for (int i = 0; i <= m; ++i)
       for (int j = 0; i + j <= m; ++j) {
         const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
         largest = std::max(largest, B.closest(p).distance);
       }
-  return largest;
-}
-
-int crossingTriangles(const TriangleSurface& S, Vec3& where) {
-  const TriangleTree tree(S.points, S.triangles);
-  int pairs = 0;
-  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
-    const std::array<int, 3>& v = S.triangles[t];
-    const std::array<Vec3, 3> A{S.points[v[0]], S.points[v[1]], S.points[v[2]]};
-    const TriangleTree::Box box = boxOf(A);
-    tree.visit(box.lo, box.hi, [&](int o) {
-      const std::array<int, 3>& w = S.triangles[o];
-      if (o <= t || std::find_first_of(v.begin(), v.end(), w.begin(), w.end()) != v.end())
-        return false;
-      const std::array<Vec3, 3> B{S.points[w[0]], S.points[w[1]], S.points[w[2]]};
-      bool cross = false;
-      Vec3 at;
-      for (int i = 0; i < 3 && !cross; ++i)
-        cross = segmentCrosses(A[i], A[(i + 1) % 3], B, at) ||
-                segmentCrosses(B[i], B[(i + 1) % 3], A, at);
-      if (cross && pairs++ == 0) where = at;
-      return false;
-    });
   }
-  return pairs;
+  return largest;
 }
 
 }  // namespace
@@ -3745,10 +3750,111 @@ Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
   return gap;
 }
 
-double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge) {
-  if (A.nodes.empty() || B.nodes.empty() || samplesPerEdge < 1)
+std::vector<Crossing> selfCrossings(const TriangleSurface& S) {
+  const TriangleTree tree(S.points, S.triangles);
+  std::vector<Crossing> crossings;
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
+    const TriangleTree::Box box = boxOf(cornersOf(S, t));
+    tree.visit(box.lo, box.hi, [&](int s) {
+      Crossing found{t, s, {}};
+      if (s > t && trianglesCross(S, t, s, found.point)) crossings.push_back(found);
+      return false;
+    });
+  }
+  return crossings;
+}
+
+namespace {
+
+/// What faces S at p, a point of triangle t, along its normal on both sides: the distance of the
+/// nearest triangle that is roughly parallel (60 degrees), beyondAll where none is within reach.
+double facingDistance(const SurfaceDistance& S, Vec3 p, int t, double reach) {
+  constexpr double parallel = .5;
+  double nearest = beyondAll;
+  for (double direction : {1., -1.}) {
+    const Vec3 q = p + direction * reach * S.faceNormal[t];
+    const TriangleTree::Box box = boxOf({p, q, q});
+    S.tree.visit(box.lo, box.hi, [&](int s) {
+      Vec3 at;
+      if (s == t || std::fabs(dot(S.faceNormal[s], S.faceNormal[t])) < parallel) return false;
+      for (int n : S.S.triangles[s])
+        if (cornerAt(S.S.triangles[t], n) < 3) return false;
+      if (segmentCrosses(p, q, cornersOf(S.S, s), at)) nearest = std::min(nearest, norm(at - p));
+      return false;
+    });
+  }
+  return nearest;
+}
+
+/// The 5 % quantile of measured widths; of equal ones the first.
+Width lowQuantile(std::vector<Width> widths) {
+  constexpr double fraction = .05;
+  if (widths.empty()) return {beyondAll, {}};
+  const auto at = widths.begin() + static_cast<std::ptrdiff_t>(fraction * double(widths.size()));
+  std::stable_sort(widths.begin(), widths.end(),
+                   [](const Width& a, const Width& b) { return a.distance < b.distance; });
+  return *at;
+}
+
+}  // namespace
+
+Width facingSheets(const SurfaceDistance& S, double reach) {
+  constexpr int samples = 4000;  // [choice] spread evenly over the area
+  double area = 0, passed = 0;
+  for (int t = 0; t < static_cast<int>(S.S.triangles.size()); ++t) area += areaOf(S.S, t);
+  std::vector<Width> widths;
+  for (int t = 0; t < static_cast<int>(S.S.triangles.size()); ++t) {
+    const std::array<Vec3, 3> c = cornersOf(S.S, t);
+    passed += areaOf(S.S, t);
+    while (double(widths.size()) + .5 < samples * (passed / area)) {
+      // the plastic sequence: points without gaps or clusters in the unit square, then the triangle
+      const double k = double(widths.size()) + 1;
+      double v = std::fmod(k * .7548776662466927, 1), w = std::fmod(k * .5698402909980532, 1);
+      if (v + w > 1) v = 1 - v, w = 1 - w;
+      const Vec3 p = c[0] + (v * (c[1] - c[0]) + w * (c[2] - c[0]));
+      widths.push_back({facingDistance(S, p, t, reach), p});
+    }
+  }
+  return lowQuantile(std::move(widths));
+}
+
+Width rimWidth(const SurfaceDistance& S, double apart) {
+  constexpr int samples = 600;  // [choice] along the rim
+  constexpr double detour = 3;  // [choice] rim between two points of a narrow part, per width
+  std::vector<int> closed = S.rim;
+  closed.push_back(S.rim[0]);
+  std::vector<Vec3> p;  // [samples], evenly along the rim
+  double length = 0, passed = 0;
+  for (std::size_t i = 0; i + 1 < closed.size(); ++i)
+    length += norm(S.S.points[closed[i + 1]] - S.S.points[closed[i]]);
+  for (std::size_t i = 0; i + 1 < closed.size(); ++i) {
+    const Vec3 a = S.S.points[closed[i]], b = S.S.points[closed[i + 1]];
+    const double edge = norm(b - a), step = length / samples;
+    for (; double(p.size()) * step < passed + edge && p.size() < samples;)
+      p.push_back(a + ((double(p.size()) * step - passed) / edge) * (b - a));
+    passed += edge;
+  }
+  std::vector<Width> widths;
+  const int n = static_cast<int>(p.size());
+  for (int i = 0; i < n; ++i) {
+    Width width{beyondAll, p[i]};
+    for (int j = 0; j < n; ++j) {
+      const double distance = norm(p[j] - p[i]);
+      const double along = std::min(std::abs(i - j), n - std::abs(i - j)) * (length / samples);
+      if (along >= detour * distance && along >= apart)
+        width.distance = std::min(width.distance, distance);
+    }
+    widths.push_back(width);
+  }
+  return lowQuantile(std::move(widths));
+}
+
+double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
+                         double spacing) {
+  if (A.nodes.empty() || B.nodes.empty() || samplesPerEdge < 1 || !(spacing > 0))
     throw InputError("hausdorffDistance: give two surfaces with triangles and samplesPerEdge >= 1");
-  return std::max(sampledDistance(A, B, samplesPerEdge), sampledDistance(B, A, samplesPerEdge));
+  return std::max(sampledDistance(A, B, samplesPerEdge, spacing),
+                  sampledDistance(B, A, samplesPerEdge, spacing));
 }
 
 // ==== Tools for 3.2: triangle–tetrahedron intersection ===========================================
@@ -3851,6 +3957,62 @@ int cubeLevel(const Mesh& M, double lc) {
   for (double diagonal = norm(M.cube); diagonal >= lc && level < maxLevel; diagonal /= 2)
     level += 3;
   return level;
+}
+
+namespace {
+
+/// The faces of ∂𝓜, of all patches.
+std::vector<std::array<int, 3>> patchFaces(const Mesh& M) {
+  std::vector<std::array<int, 3>> faces;
+  for (std::size_t p = 1; p <= M.patches.size(); ++p)
+    for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) faces.push_back(face);
+  return faces;
+}
+
+double areaOf(const TriangleSurface& S) {
+  double area = 0;
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) area += areaOf(S, t);
+  return area;
+}
+
+/// [choice] Tetrahedra that S adds at cubes of edge h: measured 36 to 55 per face of a cube.
+double predictedTets(double area, double h) {
+  constexpr double tetsPerSquare = 45;
+  return tetsPerSquare * area / (h * h);
+}
+
+}  // namespace
+
+SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
+  constexpr double rimApart = 4;    // [choice] least length of rim between two parts, of h
+  constexpr double perExtent = 20;  // [choice] l_c of the extent, of which at least 1/8 is kept
+  constexpr double lowest = 1. / 8, mostTets = 1e6;
+  constexpr double perBoundary = 2.5, perSurface = 1.75, perRim = 1.5, perSheet = 2;  // of h
+  const double root3 = std::sqrt(3.);
+  const TriangleTree::Box& box = S.tree.nodes[0].box;
+  const double extent = norm(box.hi - box.lo), largest = extent / perExtent;
+  const double finest = root3 * std::sqrt(predictedTets(areaOf(S.S), 1) / mostTets);
+  SizeChoice size{largest, "the extent of S", extent, S.S.points[S.rim[0]], largest, 0};
+  size.finest = std::min(largest, std::max(lowest * largest, finest));
+  auto limit = [&](const std::string& feature, double measure, double perH, Vec3 place) {
+    const double lc = root3 * measure / perH;
+    if (lc < size.lc) size = {lc, feature, measure, place, lc, size.finest};
+  };
+  const Width sheets = facingSheets(S, perSheet * largest / root3);
+  limit("the distance of sheets of S that face each other", sheets.distance, perSheet,
+        sheets.place);
+  const Width rim = rimWidth(S, rimApart * largest / root3);
+  limit("the width between parts of the rim of S", rim.distance, perRim, rim.place);
+  size.lc = std::max(size.lc, size.finest);
+
+  const Gap boundary = smallestGap(S.tree, M.x, patchFaces(M));
+  limit("the distance of S to the boundary", boundary.distance, perBoundary, boundary.point);
+  for (const Parametrization& earlier : M.surfaces) {
+    const Gap gap = smallestGap(S.tree, earlier.points, earlier.triangles);
+    limit("the distance of S to the surface '" + earlier.name + "'", gap.distance, perSurface,
+          gap.point);
+  }
+  return size;
 }
 
 Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc) {
@@ -4190,10 +4352,9 @@ SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
     for (int next : Q.squares[part[i]].across)
       if (!seen[next]) seen[next] = 1, part.push_back(next);
   if (euler != 2 || part.size() != Q.squares.size())
-    throw MethodError(
-        "insertSurface (§3.3): the boundary of T is no sphere (chi = " + std::to_string(euler) +
-        ", " + std::to_string(part.size()) + " of " + std::to_string(Q.squares.size()) +
-        " squares connected): S comes close to itself within l_c; lower l_c");
+    Q.fault = "the boundary of T is no sphere (chi = " + std::to_string(euler) + ", " +
+              std::to_string(part.size()) + " of " + std::to_string(Q.squares.size()) +
+              " squares connected): S comes close to itself within l_c";
   return Q;
 }
 
@@ -4300,8 +4461,12 @@ void keepLargestPart(const SquareSurface& Q, const Survey& survey, Selection& se
   part = connectedParts(
       Q, [&](int i) { return selected[i] == 0; }, sizes);
   const int outside = largestPart(sizes);
+  std::vector<char> isHole(sizes.size(), 0);  // no other part of ∂T, which may have several
   for (std::size_t i = 0; i < part.size(); ++i)
-    if (part[i] > 0 && part[i] != outside && survey.free[i]) selected[i] = fullSquare;
+    for (int next : Q.squares[i].across)
+      if (part[i] > 0 && part[i] != outside && selected[next]) isHole[part[i]] = 1;
+  for (std::size_t i = 0; i < part.size(); ++i)
+    if (isHole[part[i]] && survey.free[i]) selected[i] = fullSquare;
 }
 
 /// The number of selected quarters at node n, and of rim edges there.
@@ -5692,8 +5857,14 @@ bool contains(const Mesh& M, Vec3 p) {
 
 void checkOptions(const InsertOptions& options, std::size_t nodes) {
   constexpr int mostTets = 500000000;  // indices of four faces each fit in an int
-  if (!(options.lc > 0) || !std::isfinite(options.lc))
-    throw InputError("insertSurface (§3.2): l_c = " + number(options.lc) + " must be above 0");
+  if (!(options.lc >= 0) || !std::isfinite(options.lc))
+    throw InputError("insertSurface (§3.2): l_c = " + number(options.lc) +
+                     " must be above 0, or 0 to be chosen");
+  if (!(options.tolerance >= 0) || !std::isfinite(options.tolerance))
+    throw InputError("insertSurface (§3.2): the tolerance " + number(options.tolerance) +
+                     " must be above 0, or 0 for none");
+  if (options.lc > 0 && options.tolerance > 0)
+    throw InputError("insertSurface (§3.2): give l_c or a tolerance, not both");
   if (options.maxTets < 1 || options.maxTets > mostTets)
     throw InputError("insertSurface (§3.2): maxTets = " + std::to_string(options.maxTets) +
                      " must be from 1 to " + std::to_string(mostTets));
@@ -5724,22 +5895,18 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
 
 /// l_c against the size of what comes: not more tetrahedra than allowed, not smaller than S.
 void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) {
-  constexpr double tetsPerSquare = 45;  // [choice] measured 36 to 55 per cube face of area of S
-  constexpr int maxLevel = 57;          // 2^19 cubes along a unit of ξ: what a lattice key holds
+  constexpr int maxLevel = 57;  // 2^19 cubes along a unit of ξ: what a lattice key holds
   const int level = cubeLevel(M, lc);
   const double halving = std::exp2(-level / 3);
   const double h = halving * std::cbrt(M.cube.x * M.cube.y * M.cube.z);
-  double area = 0, farthest = 0, extent = 0;
-  for (const auto& t : S.S.triangles)
-    area +=
-        .5 * norm(cross(S.S.points[t[1]] - S.S.points[t[0]], S.S.points[t[2]] - S.S.points[t[0]]));
+  double farthest = 0, extent = 0;
   for (const Vec3& p : S.S.points) extent = std::max(extent, norm(p - S.S.points[S.rim[0]]));
   for (const Vec3& xi : M.xi) farthest = std::max({farthest, xi.x, xi.y, xi.z});
   if (extent < 2 * h)
     throw InputError("insertSurface (§3.2): S, of extent " + number(extent) +
                      ", is smaller than two cubes of edge " + number(h) + " that l_c = " +
                      number(lc) + " gives; lower l_c to " + number(.5 * lc * extent / (2 * h)));
-  const double predicted = static_cast<double>(M.tets.size()) + tetsPerSquare * area / (h * h);
+  const double predicted = static_cast<double>(M.tets.size()) + predictedTets(areaOf(S.S), h);
   if (predicted > maxTets)
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " asks for about " +
                      number(predicted) + " tetrahedra, above the limit of " +
@@ -5767,8 +5934,9 @@ struct Insertion {
   int ways = 0;    // tried so far, over all l_c
   int faults = 0;  // and left; why the last one was, without prefix and advice
   std::string reason = {};
-  bool isBlocked = false;  // at this l_c, by an earlier surface
-  double lowest = 0;       // q of the best way so far
+  bool isBlocked = false;   // at this l_c, by an earlier surface
+  bool wasBlocked = false;  // at some l_c
+  double lowest = 0;        // q of the best way so far
 
   void stage(const char* name, const Mesh& mesh) const {
     if (options.onStage) options.onStage(name, mesh);
@@ -5786,9 +5954,33 @@ struct Insertion {
   }
 };
 
+std::string describe(const std::vector<Crossing>& crossings) {
+  const std::string pairs = crossings.size() == 1 ? " pair" : " pairs";
+  return "S crosses or touches itself in " + std::to_string(crossings.size()) + pairs +
+         " of triangles, the first near " + placeText(crossings[0].point);
+}
+
 std::string describe(const Way& way) {
   return std::string(way.side > 0 ? "positive" : "negative") + " side, " +
          (way.outline == Outline::halfSquares ? "half squares" : "whole squares");
+}
+
+/// [choice] Where S_M leaves a part of S out, as a finger whose squares are hidden in T: no
+/// projection covers that. Empty: nowhere.
+std::string leftOut(const Insertion& I, const Selection& selected) {
+  constexpr double farthest = 4;  // of h, from a point of S to S_M
+  std::vector<std::array<int, 3>> triangles;
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    const std::array<int, 4>& n = I.Q.squares[i].node;
+    if (!selected[i]) continue;
+    triangles.push_back({n[0], n[1], n[2]});
+    triangles.push_back({n[0], n[2], n[3]});
+  }
+  const TriangleTree tree(I.M.x, triangles);
+  for (const Vec3& p : I.S.S.points)
+    if (tree.closest(p, farthest * I.Q.h).triangle < 0)
+      return "S_M leaves out the part of S near " + placeText(p);
+  return "";
 }
 
 /// §3.4 on both sides: the ways to go on with this outline, best first.
@@ -5796,7 +5988,11 @@ std::vector<Way> extractWays(Insertion& I, Outline outline) {
   std::vector<Way> ways;
   for (int side : {1, -1}) {
     Way way{side, outline, surfaceExtraction(I.M, I.Q, I.S, side, outline)};
-    if (way.extraction.fault.empty())
+    const std::string missing =
+        way.extraction.fault.empty() ? leftOut(I, way.extraction.selected) : "";
+    if (!missing.empty())
+      I.leave(describe(way), MethodError("insertSurface (§3.4): " + missing));
+    else if (way.extraction.fault.empty())
       ways.push_back(std::move(way));
     else
       I.leave(describe(way),
@@ -5906,6 +6102,7 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
 ///   errors  MethodError: a node of it is off S
 void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& report) {
   constexpr int samples = 4;
+  constexpr double perLc = .25;  // [choice] samples of large triangles of S
   const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
   std::vector<char> on(M.x.size(), 0);
   report.nodes = 0, report.maxNodeDistance = 0;
@@ -5923,7 +6120,8 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
     throw MethodError("insertSurface (§3.6): a node of S_M is " + number(report.maxNodeDistance) +
                       " away from S");
   report.triangles = static_cast<int>(faces.size());
-  report.hausdorff = hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples);
+  report.hausdorff =
+      hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples, perLc * report.lc);
 }
 
 /// [choice] Of l_c: a Hausdorff distance S_M - S that is warned of; and what such a way's lowest q
@@ -5987,9 +6185,9 @@ void checkFacesApart(Insertion& I) {
 /// report.
 void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, InsertReport& report) {
   // [choice] min q below which the other ways are tried too: above 50k tetrahedra they cost too
-  // much
-  constexpr double goodQuality = .6, goodLargeQuality = .45;
-  constexpr std::size_t large = 50000;
+  // much, and above 200k minutes
+  constexpr double goodQuality = .6, goodLargeQuality = .45, goodHugeQuality = .3;
+  constexpr std::size_t large = 50000, huge = 200000;
   I.M = M;
   Bisection B(I.M);
   I.A = volumetricApproximation(B, I.S, lc);
@@ -5997,10 +6195,14 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   checkFacesApart(I);
   volumetricHealing(B, I.A);
   I.Q = boundarySquares(I.M, I.A);
+  if (!I.Q.fault.empty() && I.options.outline == Outline::paper)
+    throw MethodError("insertSurface (§3.3): " + I.Q.fault + "; lower l_c");
+  if (!I.Q.fault.empty()) I.progress("3.3 healing: " + I.Q.fault + "; S_M may still be a disk");
   I.stage("healed", I.M);
   I.progress("3.2-3.3 approximation: " + std::to_string(I.M.tets.size()) + " tetrahedra, " +
              std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
-  const double good = I.M.tets.size() < large ? goodQuality : goodLargeQuality;
+  const std::size_t tets = I.M.tets.size();
+  const double good = tets < large ? goodQuality : tets < huge ? goodLargeQuality : goodHugeQuality;
   auto isGood = [&] {
     return report.surface > 0 &&
            (I.lowest >= std::min(good, report.original.min) || I.options.outline == Outline::paper);
@@ -6018,6 +6220,121 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
       }
 }
 
+/// [§3.2] The sizes to try one after the other: l_c as given and [choice] its halves; for a
+/// tolerance one for each level of the bisection, the coarsest first; else l_c as chosen, and its
+/// halves.
+std::vector<double> sizesToTry(const Mesh& M, const SurfaceDistance& S,
+                               const InsertOptions& options, const SizeChoice& chosen) {
+  constexpr int maxHalvings = 4;  // of l_c as given, while another surface is in the way
+  constexpr int maxLevels = 19;   // checkSize() refuses more
+  constexpr double aboveDiagonal = 1 + 1e-9;  // eq. (1) refines where r^E >= l_c
+  std::vector<double> sizes;
+  if (options.lc > 0)
+    for (int halving = 0; halving <= maxHalvings; ++halving)
+      sizes.push_back(std::ldexp(options.lc, -halving));
+  if (options.lc > 0) return sizes;
+  if (options.tolerance == 0) {
+    for (double lc = chosen.lc; lc >= chosen.finest || sizes.empty(); lc /= 2) sizes.push_back(lc);
+    return sizes;
+  }
+  // l_c below the distances of §3.1 and, so that two cubes fit along S, below √3/2 of its extent
+  double below = smallestGap(S.tree, M.x, patchFaces(M)).distance;
+  for (const Parametrization& earlier : M.surfaces)
+    below = std::min(below, smallestGap(S.tree, earlier.points, earlier.triangles).distance);
+  double extent = 0;
+  for (const Vec3& p : S.S.points) extent = std::max(extent, norm(p - S.S.points[S.rim[0]]));
+  below = std::min(below, .5 * std::sqrt(3.) * extent);
+  double diagonal = norm(M.cube);
+  for (int level = 0; level <= maxLevels; ++level, diagonal /= 2)
+    if (diagonal * aboveDiagonal < below) sizes.push_back(diagonal * aboveDiagonal);
+  return sizes.empty() ? std::vector<double>{below} : sizes;
+}
+
+std::string describe(const SizeChoice& size) {
+  return size.feature + " is " + number(size.measure) + " near " + placeText(size.place);
+}
+
+std::string labelOf(const std::string& name, std::size_t number) {
+  return name.empty() ? "surface " + std::to_string(number) : "surface '" + name + "'";
+}
+
+/// The earlier surface nearest to S, for messages: "'name', 12.5 away at triangle 3 near (1, 2,
+/// 3)".
+struct Nearest {
+  std::string text;
+  double distance;
+};
+Nearest nearestEarlier(const Mesh& M, const SurfaceDistance& S) {
+  Nearest nearest{"", beyondAll};
+  for (std::size_t k = 0; k < M.surfaces.size(); ++k) {
+    const Gap gap = smallestGap(S.tree, M.surfaces[k].points, M.surfaces[k].triangles);
+    if (gap.distance < nearest.distance)
+      nearest = {
+          labelOf(M.surfaces[k].name, k + 1) + " is " + number(gap.distance) + " away" + at(gap),
+          gap.distance};
+  }
+  return nearest;
+}
+
+/// Why no mesh is valid as far as S and its neighbours tell, and what to do.
+std::string advice(const Insertion& I, const Mesh& M, double largest, double lc) {
+  const SurfaceDistance& S = I.S;
+  const Nearest nearest = nearestEarlier(M, S);
+  if (nearest.distance < largest)
+    return nearest.text + ": lower l_c to " + number(.5 * nearest.distance);
+  const std::vector<Crossing> crossings = selfCrossings(S.S);
+  if (!crossings.empty()) return describe(crossings) + ": mend S there";
+  const SizeChoice size = chooseSize(M, S);
+  if (size.resolving < lc) return describe(size) + ": lower l_c to " + number(size.resolving);
+  return "lower l_c";
+}
+
+/// The search for l_c: the first of the sizes with a valid mesh, within the tolerance where one is
+/// wanted. A size after the first that asks for too many tetrahedra ends it.
+void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, Mesh& result,
+                InsertReport& report) {
+  constexpr int maxTries = 2;  // [choice] of a given l_c, with ways that were followed to the end
+  const double E = I.options.tolerance;
+  const InsertReport start = report;
+  double last = sizes[0], nearest = beyondAll;
+  int tries = 0;
+  for (std::size_t i = 0; i < sizes.size() && (I.options.lc == 0 || tries < maxTries); ++i) {
+    const int waysBefore = I.ways;
+    I.isBlocked = false;
+    try {
+      checkSize(M, I.S, sizes[i], I.options.maxTets);
+      last = sizes[i];
+      report = start;
+      insertWithSize(I, M, last, result, report);
+      if (report.surface > 0 && (E == 0 || report.hausdorff <= E)) return;
+      if (report.surface > 0) {
+        I.leave("l_c = " + number(last),
+                MethodError("the Hausdorff distance S_M - S is " + number(report.hausdorff)));
+        nearest = std::min(nearest, report.hausdorff);
+      }
+    } catch (const MethodError& error) {
+      I.leave("l_c = " + number(last), error);
+    } catch (const InputError& error) {
+      if (i == 0) throw;
+      I.leave("l_c = " + number(sizes[i]), error);
+      break;
+    }
+    I.wasBlocked = I.wasBlocked || I.isBlocked;
+    if (I.ways > waysBefore || !I.isBlocked) ++tries;
+  }
+  if (nearest < beyondAll)
+    throw MethodError("insertSurface (§3.2): no mesh within the tolerance " + number(E) +
+                      " at l_c = " + number(sizes[0]) + " to " + number(last) +
+                      ": the nearest has the Hausdorff distance " + number(nearest) +
+                      ", and the next was left because " + I.reason +
+                      "; raise the tolerance or the limit");
+  const std::string wanted = E > 0 ? " within the tolerance " + number(E) : "";
+  throw MethodError("insertSurface (§3): no valid mesh" + wanted + " at l_c = " + number(sizes[0]) +
+                    (last < sizes[0] ? " nor down to " + number(last) : "") + ", after " +
+                    std::to_string(I.faults) + " tries, the last because " + I.reason + "; " +
+                    advice(I, M, sizes[0], last));
+}
+
 }  // namespace
 
 namespace {
@@ -6032,6 +6349,9 @@ struct Candidate {
 Candidate candidateOf(const TriangleSurface& S, const std::string& label,
                       std::vector<std::string> warnings = {}) {
   TriangleSurface disk = checkSurface(S, warnings);
+  const std::vector<Crossing> crossings = selfCrossings(disk);
+  if (!crossings.empty())
+    warnings.push_back(describe(crossings) + "; mend it there if the insertion fails");
   splitChords(disk);
   return {SurfaceDistance(disk), label, std::move(warnings)};
 }
@@ -6049,10 +6369,6 @@ auto labelled(const std::string& label, Step step) -> decltype(step()) {
   } catch (const SolverError& error) {
     throw SolverError(prefix + error.what());
   }
-}
-
-std::string labelOf(const std::string& name, std::size_t number) {
-  return name.empty() ? "surface " + std::to_string(number) : "surface '" + name + "'";
 }
 
 /// The surfaces of a call, each component one; labels only where there are several.
@@ -6092,66 +6408,29 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
   }
 }
 
-/// The earlier surface nearest to S, for messages: "'name', 12.5 away at triangle 3 near (1, 2,
-/// 3)".
-struct Nearest {
-  std::string text;
-  double distance;
-};
-Nearest nearestEarlier(const Mesh& M, const SurfaceDistance& S) {
-  Nearest nearest{"", beyondAll};
-  for (std::size_t k = 0; k < M.surfaces.size(); ++k) {
-    const Gap gap = smallestGap(S.tree, M.surfaces[k].points, M.surfaces[k].triangles);
-    if (gap.distance < nearest.distance)
-      nearest = {
-          labelOf(M.surfaces[k].name, k + 1) + " is " + number(gap.distance) + " away" + at(gap),
-          gap.distance};
-  }
-  return nearest;
-}
-
-/// 3.2 to 3.7 for one surface; with half of l_c where no way is valid, and again where another
-/// surface is in the way.
+/// 3.2 to 3.7 for one surface, at the sizes that are to be tried.
 InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
-  constexpr int maxTries = 2;     // [choice] of l_c, with ways that were followed to the end
-  constexpr int maxHalvings = 4;  // [choice] of l_c in all, while another surface is in the way
   const SurfaceDistance& cleaned = candidate.S;
   InsertReport report;
   report.original = qualityStatistics(M);
-  checkDistances(M, cleaned, options.lc);
-  checkSize(M, cleaned, options.lc, options.maxTets);
 
+  SizeChoice chosen;
   Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1};
-  Mesh result;
-  double lc = options.lc;
-  bool wasBlocked = false;
-  for (int tries = 0, halvings = 0; tries < maxTries && halvings <= maxHalvings; ++halvings) {
-    const int waysBefore = I.ways;
-    I.isBlocked = false;
-    try {
-      if (halvings > 0) checkSize(M, cleaned, lc, options.maxTets);
-      insertWithSize(I, M, lc, result, report);
-    } catch (const MethodError& error) {
-      I.leave("l_c = " + number(lc), error);
-    }
-    if (report.surface > 0) break;
-    wasBlocked = wasBlocked || I.isBlocked;
-    if (I.ways > waysBefore || !I.isBlocked) ++tries;
-    lc /= 2;
+  if (options.lc == 0 && options.tolerance == 0) {
+    chosen = chooseSize(M, cleaned);
+    I.progress("3.2 l_c = " + number(chosen.lc) + " chosen: " + describe(chosen));
   }
-  const Nearest nearest = report.lc < options.lc ? nearestEarlier(M, cleaned) : Nearest{"", 0};
-  if (report.surface == 0)
-    throw MethodError("insertSurface (§3): no valid mesh at l_c = " + number(options.lc) +
-                      " nor down to " + number(2 * lc) + ", after " + std::to_string(I.faults) +
-                      " tries, the last because " + I.reason +
-                      (nearest.distance < options.lc
-                           ? "; " + nearest.text + ": lower l_c to " + number(.5 * nearest.distance)
-                           : "; lower l_c"));
+  const std::vector<double> sizes = sizesToTry(M, cleaned, options, chosen);
+  checkDistances(M, cleaned, sizes[0]);
+  Mesh result;
+  searchSize(I, M, sizes, result, report);
+  report.size = chosen;
   std::vector<std::string> warnings = candidate.warnings;
-  if (report.lc < options.lc)
-    warnings.push_back(
-        "l_c was lowered from " + number(options.lc) + " to " + number(report.lc) + ", because " +
-        (wasBlocked ? nearest.text : "at " + number(options.lc) + " no way was valid"));
+  if (options.tolerance == 0 && report.lc < sizes[0])
+    warnings.push_back("l_c was lowered from " + number(sizes[0]) + " to " + number(report.lc) +
+                       ", because " +
+                       (I.wasBlocked ? nearestEarlier(M, cleaned).text
+                                     : "at " + number(2 * report.lc) + " " + I.reason));
   report.warnings.insert(report.warnings.begin(), warnings.begin(), warnings.end());
   report.regular = qualityStatistics(result, Ideal::regular);
   I.stage("smoothed", result);

@@ -3369,14 +3369,20 @@ void printInsertion(const std::vector<InsertReport>& reports, const Mesh& M, con
   for (const InsertReport& r : reports)
     io.out << format(
         "surface %d (%.60s), l_c %.6g: %d nodes, %d triangles, largest node distance "
-        "%.3g, Hausdorff distance %.3g\n",
+        "%.3g, Hausdorff distance %.3g, tangential shift %.3g\n",
         r.surface, M.surfaces[r.surface - 1].name.c_str(), r.lc, r.nodes, r.triangles,
-        r.maxNodeDistance, r.hausdorff);
+        r.maxNodeDistance, r.hausdorff, r.tangentialShift);
 }
 
 InsertOptions insertOptions(const Arguments& a) {
   InsertOptions o = a.has("--paper") ? InsertOptions::paper() : InsertOptions{};
+  if (a.has("--lc") && a.has("--tolerance"))
+    throw UsageError("--lc and --tolerance both choose the size; give one of them, or none");
+  for (const char* length : {"--lc", "--tolerance"})
+    if (a.has(length) && !(a.number(length, 0.) > 0))
+      fail(std::string("insert: ") + length + " " + a.options.at(length)[0] + " must be above 0");
   o.lc = a.number("--lc", o.lc);
+  o.tolerance = a.number("--tolerance", o.tolerance);
   o.maxTets = a.number("--max-tets", o.maxTets);
   o.optimize.power = a.number("--power", o.optimize.power);
   return o;
@@ -3458,7 +3464,6 @@ std::vector<TriangleSurface> readSurfaces(const Arguments& a, Progress& progress
 
 void runInsert(const Arguments& a, const Streams& io) {
   const std::string path = a.output();
-  if (!a.has("--lc")) throw UsageError("the size is missing: --lc L");
   InsertOptions options = insertOptions(a);
   const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
   for (const char* stage : {"original", "refined", "projected", "smoothed"})
@@ -3742,7 +3747,12 @@ const std::vector<Command>& commands() {
        2,
        1000,
        {outputOption,
-        {"--lc", "L", "element size at the surface, eq. (1), in the unit of the input"},
+        {"--lc", "L",
+         "element size at the surface, eq. (1), in the unit of the input (default: chosen by the\n"
+         "                       features of the surface, and told)"},
+        {"--tolerance", "E",
+         "instead of --lc: the coarsest size at which the two-sided Hausdorff distance of the\n"
+         "                       inserted faces and the surface is at most E, unit of the input"},
         paperOption,
         powerOption,
         {"--stages", "PREFIX",
@@ -3810,8 +3820,8 @@ std::string usageLine(const Command& c) {
   for (const Option& o : c.options) {
     const std::string one = std::string(o.name) + (*o.values ? " " : "") + o.values;
     const std::string name = o.name;
-    const bool needed = name == "-o" || name == "--lc" || name == "--top" ||
-                        (name == "--eps" && std::string(c.name) == "solid");
+    const bool needed =
+        name == "-o" || name == "--top" || (name == "--eps" && std::string(c.name) == "solid");
     line += needed ? " " + one : " [" + one + "]";
   }
   return line;

@@ -234,8 +234,22 @@ struct OptimizeReport {
 /// with whole squares, or with half squares too.
 enum class Outline { paper, squares, halfSquares };
 
+/// [§3.2] How l_c was chosen: see chooseSize().
+struct SizeChoice {
+  double lc = 0;             // l_c, length unit of the input
+  std::string feature = {};  // what limits it: "the extent of S", "the width of S between its rims"
+                             // ...
+  double measure = 0;        // its length
+  Vec3 place;                // a point of S where it is that small
+  double resolving = 0;      // the l_c that resolves the feature; below lc where that is too fine
+  double finest = 0;         // the least l_c that is chosen for features of S itself
+};
+
 struct InsertOptions {
-  double lc = 0;  // [eq. (1)] l_c, length unit of the input; > 0 and below dist(∂M, S)
+  double lc = 0;  // [eq. (1)] l_c, length unit of the input; below dist(∂M, S). 0: chooseSize()
+  // [§3.2] > 0, and lc = 0: the coarsest l_c at which the measured two-sided Hausdorff distance of
+  // S_M and S is at most this
+  double tolerance = 0;
   Outline outline = Outline::halfSquares;  // [§3.5 departure]
   bool followRim = true;     // [§3.6 departure] rim correspondence and anchored equations
   int maxTets = 20000000;    // refuse where more tetrahedra are predicted
@@ -253,6 +267,7 @@ struct InsertOptions {
 struct InsertReport {
   int surface = 0;               // its number k: M.surfaces[k-1], faces labelled k
   double lc = 0;                 // as used
+  SizeChoice size;               // how it was chosen, where options.lc = 0 and no tolerance
   int way = 0;                   // which of the tried ways (sides, outlines) was taken, from 1
   int nodes = 0, triangles = 0;  // of S_M
   double maxNodeDistance = 0;    // largest |x_i - S| of the nodes of S_M
@@ -630,8 +645,29 @@ struct Gap {
 Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
                 const std::vector<std::array<int, 3>>& triangles);
 
-/// Two-sided Hausdorff distance, sampled: each triangle at a lattice of samplesPerEdge >= 1 steps.
-double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge);
+/// [§3.1] Pairs of triangles that cross or touch beyond their common points, and where. A pair with
+/// a common edge is none.
+struct Crossing {
+  int triangle, other;
+  Vec3 point;
+};
+std::vector<Crossing> selfCrossings(const TriangleSurface& S);
+
+/// [§3.2] The distance of sheets of S that face each other: the 5 % quantile over S of the distance
+/// along the normals; 1e300 where none is within `reach`.
+struct Width {
+  double distance;
+  Vec3 place;
+};
+Width facingSheets(const SurfaceDistance& S, double reach);
+/// [§3.2] The width of S, or of a notch, between parts of its rim: the 5 % quantile over the rim of
+/// the distance to points at least three times as far along the rim, and at least `apart`.
+Width rimWidth(const SurfaceDistance& S, double apart);
+
+/// Two-sided Hausdorff distance, sampled: each triangle at a lattice of samplesPerEdge >= 1 steps,
+/// more where these would be longer than `spacing`.
+double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
+                         double spacing = 1e300);
 
 // ==== 3.2 Volumetric approximation ==============================================================
 
@@ -645,6 +681,12 @@ double longestEdge(const Mesh& M, int E);
 int cubeLevel(const Mesh& M, double lc);
 /// [§3.2, eq. (1)] r^E >= l_c: the element is to be refined.
 bool isTooLarge(const Mesh& M, int E, double lc);
+
+/// [§3.2 choice] l_c "determined by the geometric features of S": the largest with l_c <= extent /
+/// 20 and cubes of edge h = l_c / √3 that resolve the distances to ∂M (h <= distance / 2.5) and to
+/// the surfaces in M (/ 1.75), S between its rims (/ 1.5) and sheets that face each other (/ 2).
+/// For the last two not below 1/8 of what the extent gives, nor more than about 10⁶ tetrahedra.
+SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S);
 
 /// 𝓣: the tetrahedra cut by S, and more; all of at least this level once §3.2 is done.
 struct Approximation {
@@ -684,17 +726,19 @@ struct Square {
   Vec3 centre;                    // physical
   int diagonal = 0;  // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
 };
-/// ∂𝓣 as squares, a topological sphere.
+/// ∂𝓣 as squares, a topological sphere but for `fault`.
 struct SquareSurface {
-  int level = 0;  // of 𝓣
-  double h = 0;   // physical edge of a cube
+  std::string fault = {};  // why it is no sphere; empty: it is one
+  int level = 0;           // of 𝓣
+  double h = 0;            // physical edge of a cube
   std::vector<Square> squares;
   std::vector<std::uint64_t> keys;          // [squares], place in the computational lattice
   std::vector<int> nodes;                   // mesh nodes on ∂𝓣
   std::vector<int> start;                   // [mesh nodes + 1], rows of around
   std::vector<std::pair<int, int>> around;  // (square, corner) at each node
 };
-/// [§3.3, §3.4] errors: MethodError where ∂𝓣 is no sphere.
+/// [§3.3, §3.4] [departure] Where ∂𝓣 is no sphere it says so in `fault`: a pocket in a finger two
+/// cubes wide, or fingers that nearly touch, spoil one side of S and leave S_M a disk on the other.
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
 
 /// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1
@@ -912,6 +956,8 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational)
 /// [§3] Inserts S into M: 3.2 approximation, 3.3 healing, 3.4 extraction, 3.5 surface healing,
 /// 3.6 projection, 3.7 optimization. Afterwards 0 elements are inverted and every node of S_M lies
 /// on S.
+/// [choice] Where no way is valid l_c is halved: once where options.lc gives it, else down to 1/8
+/// of what the extent of S gives.
 ///   errors  InputError: S, M or the options break §3.1 (see checkSurface), l_c is not below
 ///   dist(∂M, S) or the
 ///           distance to an earlier surface, too many tetrahedra; MethodError: a step cannot reach

@@ -53,6 +53,43 @@ struct Row {
   bool valid = true;    // false: either outcome will do
 };
 
+/// Single surfaces: faults at 1200 m, scans with the l_c that is chosen and at diagonal / 40, and
+/// those that must be refused.
+void addSingleRows(std::vector<Row>& all) {
+  for (const char* file : {"fault_red_mountain.obj", "fault_red_mountain_native.obj",
+                           "fault_northridge_frew_utm.obj",
+                           "WTRA-ORFZ-SFNV-Northridge_Frew_fault-CFM2.ts"}) {
+    Row fault{file + std::string(" 1200"), {file}, 1200};
+    fault.figures = {.45, 0, 0, 2};
+    all.push_back(fault);
+  }
+  const std::pair<const char*, Figures> chosen[] = {{"claudius_SmallFault.ts", {.45, 0, 0, 2}},
+                                                    {"open_lilium.obj", {.4, 0, 0, 0}},
+                                                    {"open_woody_planar.obj", {.5, 0, 0, 0}},
+                                                    {"open_hand_lowres.obj", {}},
+                                                    {"open_demosthenes.obj", {}},
+                                                    {"open_camelhead.obj", {}}};
+  for (const auto& [file, figures] : chosen)
+    for (double part : {0., 1. / 40}) {
+      Row scan{file + std::string(part > 0 ? " diagonal/40" : " chosen"), {file}};
+      scan.lcOfDiagonal = part, scan.marginOfDiagonal = .25, scan.figures = figures;
+      // refused, or valid: fingers and sheets near each other; it crosses itself
+      scan.valid = figures.min > 0;
+      scan.slow = !scan.valid;
+      all.push_back(scan);
+    }
+  const std::pair<const char*, const char*> refused[] = {
+      {"neg_torus_genus1.obj", "closed"},
+      {"neg_white_wolf_nonmanifold.obj", "non-manifold"},
+      {"neg_42400-IDGH.stl", "holes"},
+      {"neg_footbones_26components.ply", "closed"}};
+  for (const auto& [file, reason] : refused) {
+    Row row{file, {file}};
+    row.marginOfDiagonal = .25, row.refused = {reason};
+    all.push_back(row);
+  }
+}
+
 std::vector<Row> rows() {
   std::vector<Row> all;
   const Figures set{.35, .89, .2, 0};
@@ -90,6 +127,7 @@ std::vector<Row> rows() {
   Row fine{"cfm_mojave 500", {"cfm_mojave"}, 500};
   fine.figures = {.25, 0, 0, 0}, fine.slow = true;
   all.push_back(fine);
+  addSingleRows(all);
   return all;
 }
 

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: MIT
 // §3.1: what a surface must be, and the distance tools of §3.2 and §3.4.
 #include "../meccano.hpp"
+#include "../samples/surfaces.hpp"
 
 #include <doctest/doctest.h>
 
@@ -349,6 +350,34 @@ TEST_SUITE("3.2") {
     CHECK(hausdorffDistance(small, large, 4) == doctest::Approx(std::sqrt(4 + .25)));
     CHECK(hausdorffDistance(large, small, 4) == hausdorffDistance(small, large, 4));
     CHECK_THROWS_AS(hausdorffDistance(small, large, 0), InputError);
+    CHECK_THROWS_AS(hausdorffDistance(small, large, 4, 0), InputError);
+    // a large triangle over a small bump: found where the lattice is finer than it
+    const TriangleTree flat({{-9, -9, 0}, {9, -9, 0}, {0, 9, 0}}, {{0, 1, 2}});
+    const std::vector<Vec3> bumped{{-9, -9, 0}, {9, -9, 0}, {0, 9, 0}, {.1, .2, 1}};
+    const TriangleTree bump(bumped, {{0, 1, 3}, {1, 2, 3}, {2, 0, 3}});
+    CHECK(hausdorffDistance(flat, bump, 1, .1) > .9 * hausdorffDistance(bump, flat, 1, .1));
+  }
+}
+
+TEST_SUITE("3.1") {
+  TEST_CASE("selfCrossings: none on embedded surfaces, pairs and place where a strip passes through itself") {
+    for (const TriangleSurface& S : {samples::sine(.2, 24), samples::helicoid(.5), samples::raggedRim(), samples::disc()})
+      CHECK(selfCrossings(S).empty());
+    // a loop like the letter alpha: its ends cross on the line x = 0, z = 1
+    const TriangleSurface alpha = samples::sheet(41, 4, [](double s, double t) {
+      const double a = 1.5 * s;
+      return Vec3{a * (a * a - 1), t, a * a};
+    });
+    const std::vector<Crossing> crossings = selfCrossings(alpha);
+    CHECK(crossings.size() >= 4);
+    for (const Crossing& c : crossings) {
+      CHECK(c.triangle < c.other);
+      CHECK(std::abs(c.point.x) <= .02);
+      CHECK(c.point.z == doctest::Approx(1).epsilon(.02));
+    }
+    // two triangles with a common point, one edge through the other
+    CHECK(selfCrossings({{{0, 0, 0}, {2, 0, 0}, {0, 2, 0}, {1, .5, -1}, {.5, 1, 1}}, {{0, 1, 2}, {0, 3, 4}}}).size() == 1);
+    CHECK(selfCrossings({{{0, 0, 0}, {2, 0, 0}, {0, 2, 0}, {-1, -.5, -1}, {-.5, -1, 1}}, {{0, 1, 2}, {0, 3, 4}}}).empty());
   }
 }
 

@@ -153,6 +153,27 @@ std::string refusal(const TriangleSurface& S, double lc) {
 
 bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
+/// A gutter: two parallel planes of height 1 and length 2 with this distance, joined by half a cylinder.
+TriangleSurface gutter(double distance) {
+  const double R = distance / 2, length = 2 + samples::pi * R;
+  return samples::sheet(60, 20, [=](double s, double t) {
+    const double a = .5 * length * s, bent = samples::pi * R / 2, over = std::abs(a) - bent;
+    const double angle = std::clamp(a, -bent, bent) / R, side = a > 0 ? 1 : -1;
+    return Vec3{R * std::sin(angle), t, -R * std::cos(angle)} + Vec3{0, 0, over > 0 ? over : 0} +
+           (over > 0 ? Vec3{side * R, 0, 0} - Vec3{R * std::sin(angle), 0, -R * std::cos(angle)} : Vec3{});
+  });
+}
+
+/// A flat strip of this width and length 2 about c.
+TriangleSurface flatStrip(double width, Vec3 c = {}) {
+  return samples::sheet(40, 4, [=](double s, double t) { return c + Vec3{s, .5 * width * t, 0}; });
+}
+
+/// What chooseSize() says of S in a box that is far away, or this mesh.
+SizeChoice sizeOf(const TriangleSurface& S, const Mesh& M = boxMesh({-9, -9, -9}, {18, 18, 18}, {2, 2, 2})) {
+  return chooseSize(M, SurfaceDistance(S));
+}
+
 }  // namespace
 
 TEST_SUITE("3.2") {
@@ -304,7 +325,7 @@ TEST_SUITE("3.2") {
 
   TEST_CASE("limits: l_c must be above 0 and finite") {
     const double nan = std::numeric_limits<double>::quiet_NaN(), infinite = std::numeric_limits<double>::infinity();
-    for (double lc : {0., -1., nan, infinite, -infinite}) {
+    for (double lc : {-1., nan, infinite, -infinite}) {
       CAPTURE(lc);
       const std::string text = refusal(samples::sine(.1, 8), lc);
       CHECK(has(text, "l_c"));
@@ -361,5 +382,66 @@ TEST_SUITE("3.2") {
       CHECK(has(text, "l_c"));
       CHECK(has(text, "limit"));
     }
+  }
+
+  TEST_CASE("chooseSize: a square is limited by its extent, a twentieth of it") {
+    const TriangleSurface S = sheetAt({0, 0, 0}, 1);
+    const SizeChoice size = sizeOf(S);
+    CHECK(has(size.feature, "extent"));
+    CHECK(size.lc == doctest::Approx(shapes::diagonal(S) / 20));
+    CHECK(size.measure == doctest::Approx(shapes::diagonal(S)));
+    CHECK(size.resolving == size.lc);
+    CHECK(size.finest >= size.lc / 8);  // or what about a million tetrahedra allow
+    CHECK(size.finest <= size.lc / 4);
+  }
+
+  TEST_CASE("chooseSize: two facing sheets get two cubes between them, the place is on one of them") {
+    for (double distance : {.02, .04, .08}) {
+      CAPTURE(distance);
+      const TriangleSurface S = gutter(distance);
+      const Width sheets = facingSheets(SurfaceDistance(S), .2);
+      CHECK(sheets.distance == doctest::Approx(distance).epsilon(.01));
+      CHECK(facingSheets(SurfaceDistance(S), .9 * distance).distance == 1e300);
+      const SizeChoice size = sizeOf(S);
+      CHECK(has(size.feature, "sheets"));
+      CHECK(size.lc == doctest::Approx(std::sqrt(3.) * distance / 2).epsilon(.01));
+      CHECK(std::abs(std::abs(size.place.x) - distance / 2) <= .05 * distance);
+    }
+  }
+
+  TEST_CASE("chooseSize: a strip gets one and a half cubes across, a square none for its width") {
+    for (double width : {.05, .08}) {
+      CAPTURE(width);
+      CHECK(rimWidth(SurfaceDistance(flatStrip(width)), .4).distance == doctest::Approx(width).epsilon(.02));
+      const SizeChoice size = sizeOf(flatStrip(width));
+      CHECK(has(size.feature, "rim"));
+      CHECK(size.lc == doctest::Approx(std::sqrt(3.) * width / 1.5).epsilon(.02));
+      CHECK(std::abs(std::abs(size.place.y) - width / 2) <= 1e-12);
+    }
+    CHECK(rimWidth(SurfaceDistance(sheetAt({0, 0, 0}, 1)), .4).distance == 1e300);
+    CHECK(rimWidth(SurfaceDistance(samples::raggedRim()), .2).distance > .1);  // noise is no width
+  }
+
+  TEST_CASE("chooseSize: features too fine are not followed below 1/8, and the l_c that resolves them is told") {
+    const SizeChoice strip = sizeOf(flatStrip(.002)), sheets = sizeOf(gutter(.002));
+    CHECK(strip.lc == doctest::Approx(strip.finest));
+    CHECK(strip.resolving == doctest::Approx(std::sqrt(3.) * .002 / 1.5).epsilon(.02));
+    CHECK(sheets.lc == doctest::Approx(sheets.finest));
+    CHECK(sheets.resolving < .5 * sheets.lc);
+  }
+
+  TEST_CASE("chooseSize: near the boundary and near an earlier surface l_c stays below the distance") {
+    Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
+    const SizeChoice low = sizeOf(sheetAt({.5, .5, .041}, .3), M);
+    CHECK(has(low.feature, "boundary"));
+    CHECK(low.measure == doctest::Approx(.011).epsilon(.001));
+    CHECK(low.lc == doctest::Approx(std::sqrt(3.) * low.measure / 2.5));
+    InsertOptions options;
+    options.lc = .12;
+    insertSurface(M, samples::named(sheetAt({.5, .5, .5}, .2), "first"), options);
+    const SizeChoice near = sizeOf(sheetAt({.5, .5, .515}, .2), M);
+    CHECK(has(near.feature, "'first'"));
+    CHECK(near.lc < near.measure);
+    CHECK(near.measure == doctest::Approx(.015).epsilon(.1));
   }
 }

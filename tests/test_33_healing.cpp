@@ -390,7 +390,7 @@ TEST_SUITE("3.3") {
     CHECK_THROWS_AS(volumetricHealing(B, A), MethodError);
   }
 
-  TEST_CASE("healing: a ring, two parts, or a hollow T is no sphere; the message says so") {
+  TEST_CASE("healing: a ring, two parts, or a hollow T is no sphere, and that is told") {
     const Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {5, 5, 5});
     auto inner = [](int i) { return i >= 1 && i <= 3; };
     const Approximation tries[] = {
@@ -400,15 +400,9 @@ TEST_SUITE("3.3") {
           return inner(i) && inner(j) && inner(k) && !(i == 2 && j == 2 && k == 2);
         })};
     for (const Approximation& A : tries) {
-      std::string text;
-      try {
-        boundarySquares(M, A);
-      } catch (const MethodError& error) {
-        text = error.what();
-      }
+      const std::string text = boundarySquares(M, A).fault;
       CAPTURE(text);
       CHECK(text.find("no sphere") != std::string::npos);
-      CHECK(text.find("lower l_c") != std::string::npos);
     }
   }
 }

@@ -311,6 +311,64 @@ TEST_SUITE("3") {
     }
   }
 
+  TEST_CASE("insertion: without l_c it is chosen, told, and the promises hold") {
+    const Mesh before = unitBox();
+    const TriangleSurface S = samples::sine(.1, 24);
+    Mesh M = before;
+    std::string told;
+    InsertOptions options;
+    options.onProgress = [&](const std::string& line) {
+      if (has(line, "chosen")) told = line;
+    };
+    const InsertReport report = insertSurface(M, S, options);
+    checkPromises(before, M, S, 1, report, 1e-12 * shapes::diagonal(S));
+    CHECK(has(told, report.size.feature));
+    CHECK(report.size.lc == report.lc);
+    CHECK(report.lc < shapes::diagonal(S) / 19);
+    CHECK(report.hausdorff <= .5 * report.lc);
+  }
+
+  TEST_CASE("insertion: a tolerance is met by the coarsest level of the bisection that does it") {
+    const TriangleSurface S = samples::sine(.1, 24);
+    for (double E : {.03, .006}) {
+      CAPTURE(E);
+      const Mesh before = unitBox();
+      Mesh M = before;
+      InsertOptions options;
+      options.tolerance = E;
+      const InsertReport report = insertSurface(M, S, options);
+      checkPromises(before, M, S, 1, report, 1e-12 * shapes::diagonal(S));
+      CHECK(report.hausdorff <= E);
+      CHECK(literalHausdorff(M, 1, S) <= E);
+      // a level coarser: no valid mesh, or farther from S
+      Mesh coarse = before;
+      try {
+        const InsertReport other = insertSurface(coarse, S, withSize(2 * report.lc));
+        CHECK((other.lc < 1.5 * report.lc || other.hausdorff > E));
+      } catch (const Error&) {
+        CHECK(shapes::sameMesh(coarse, before));
+      }
+    }
+  }
+
+  TEST_CASE("insertion: wrong tolerances are refused, one out of reach with the distance reached") {
+    Mesh M = unitBox();
+    const TriangleSurface S = samples::sine(.1, 24);
+    InsertOptions options;
+    for (double E : {-1., std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {
+      options.tolerance = E;
+      CHECK(has(refusal(M, S, options, true), "tolerance"));
+    }
+    options.tolerance = .01, options.lc = .1;
+    CHECK(has(refusal(M, S, options, true), "not both"));
+    options.tolerance = 1e-5, options.lc = 0, options.maxTets = 20000;
+    const std::string text = refusal(M, S, options, false);
+    CAPTURE(text);
+    CHECK(has(text, "within the tolerance 1e-05"));
+    CHECK(has(text, "limit of 20000"));
+    CHECK(has(text, "nearest"));
+  }
+
   TEST_CASE("insertion: a second surface far from the first") {
     Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
     const TriangleSurface low = sheetAt({.5, .5, .25}, .2, .03), high = sheetAt({.5, .5, .74}, .2, -.03);
@@ -463,7 +521,7 @@ TEST_SUITE("3") {
   TEST_CASE("failure: options out of range leave the mesh as it was") {
     const TriangleSurface S = samples::sine(.1, 16);
     Mesh M = unitBox();
-    for (double lc : {0., -.1, .5, 1e-6, std::nan("")}) CHECK(has(refusal(M, S, withSize(lc), true), "l_c"));
+    for (double lc : {-.1, .5, 1e-6, std::nan("")}) CHECK(has(refusal(M, S, withSize(lc), true), "l_c"));
     InsertOptions small = withSize(.12);
     small.maxTets = 100;
     CHECK(has(refusal(M, S, small, true), "limit"));

@@ -971,7 +971,8 @@ TEST_SUITE("command line") {
         {"box", "-o", folder / "m"}, {"stats"},
         {"convert", mesh}, {"convert", mesh, folder / "m.txt"}, {"optimize", mesh, "--ideal", mesh},
         {"stats", mesh, mesh}, {"insert", mesh, "-o", mesh, "--lc", "1"},
-        {"insert", mesh, "s.obj", "--lc", "1"}, {"insert", mesh, "s.obj", "-o", mesh},
+        {"insert", mesh, "s.obj", "--lc", "1"},
+        {"insert", mesh, "s.obj", "-o", mesh, "--lc", "1", "--tolerance", "1"},
         {"insert", mesh, "s.obj", "-o", mesh, "--lc", "0.1x"}, {"optimize", mesh}};
     for (const std::vector<std::string>& words : wrong) {
       CAPTURE(words.size());
