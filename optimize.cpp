@@ -1156,11 +1156,13 @@ class Anderson {
   std::vector<Vec3> states() const;
   void setState(int row, Vec3 state);
   void record();
+  void recordSigma();
   NormalEquations normalEquations() const;
   void mix(const std::array<double, mostMixed>& gamma);
   bool undoInvalid();
 
   Smoother& S;
+  std::vector<float> sigma_;                     // [tets] after the sweep
   int recorded_ = 0;                             // sweeps since the last restart
   double last_ = 0;                              // |r|² of the last sweep
   std::vector<Vec3> start_, plain_, lastPlain_;  // [rows] x, G(x), and that before
@@ -1191,6 +1193,14 @@ void Anderson::setState(int row, Vec3 state) {
 std::array<float, 3> difference(Vec3 a, Vec3 b) {
   const Vec3 d = a - b;
   return {static_cast<float>(d.x), static_cast<float>(d.y), static_cast<float>(d.z)};
+}
+
+/// σ after the sweep.
+void Anderson::recordSigma() {
+  sigma_.resize(S.M.tets.size());
+  forPieces(S.threads, 0, static_cast<int>(sigma_.size()), piece, [&](int, int from, int to) {
+    for (int E = from; E < to; ++E) sigma_[E] = static_cast<float>(sigmaOf(S, E));
+  });
 }
 
 /// r, and from the second sweep on ΔR and ΔG in place of the oldest.
@@ -1247,13 +1257,22 @@ void Anderson::mix(const std::array<double, mostMixed>& gamma) {
   });
 }
 
-/// Puts the nodes of inverted elements and folded sheets back to G(x). Returns whether there were
-/// any.
+/// Below this part of an element's σ after the sweep the mixture went astray: near an inverted
+/// state sweeps move little as well.
+constexpr double keptSigma = .5;
+
+/// Puts the nodes of elements that lost σ and of folded sheets back to G(x). Returns whether there
+/// were any.
 bool Anderson::undoInvalid() {
+  const int tets = static_cast<int>(S.M.tets.size());
+  std::vector<std::vector<int>> lost(tets / piece + 1);
+  forPieces(S.threads, 0, tets, piece, [&](int k, int from, int to) {
+    for (int E = from; E < to; ++E)
+      if (!(sigmaOf(S, E) > keptSigma * sigma_[E])) lost[k].push_back(E);
+  });
   std::vector<int> undone;
-  if (validity(S).inverted > 0)
-    for (int E = 0; E < static_cast<int>(S.M.tets.size()); ++E)
-      if (!(sigmaOf(S, E) > 0)) undone.insert(undone.end(), S.M.tets[E].begin(), S.M.tets[E].end());
+  for (const std::vector<int>& ofPiece : lost)
+    for (int E : ofPiece) undone.insert(undone.end(), S.M.tets[E].begin(), S.M.tets[E].end());
   for (int n : S.order)
     if (S.freedom[n] == 2 && !staysUnfolded(S, n, S.M.parameter[n])) {
       undone.push_back(n);
@@ -1274,6 +1293,7 @@ void Anderson::afterSweep() {
   if (equations.rr > growth * growth * last_) recorded_ = 0;
   last_ = equations.rr;
   if (recorded_ > 0) {
+    recordSigma();
     mix(equations.solve(std::min(recorded_, memory())));
     int rounds = 0;
     while (undoInvalid())
@@ -1298,6 +1318,15 @@ struct Functional {
 /// to 0 there; with 1/8 the cube turned by 3 rad stays tangled.
 constexpr double volumeWeight = 1;
 
+Mat3 jacobianOf(const Smoother& S, std::size_t E) {
+  const std::array<int, 4>& tet = S.M.tets[E];
+  const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
+  const Vec3 x = S.M.x[tet[0]];
+  Mat3 J{};
+  for (int k = 1; k < 4; ++k) J = J + outer(S.M.x[tet[k]] - x, g[k]);
+  return J;
+}
+
 /// Σ η + (1 + σ²)/(2h) over the mesh, with its gradient at the free inner nodes, σ_min, and the
 /// diagonal of the Hessian's part 2 η |g|²/N.
 ///   source  Garanzha et al., Foldover-free maps in 50 lines of code
@@ -1306,25 +1335,32 @@ Functional meshFunctional(const Smoother& S, double delta, std::vector<Vec3>& gr
   Functional sum{0, unbounded};
   gradient.assign(S.M.x.size(), {});
   diagonal.assign(S.M.x.size(), 0);
-  for (std::size_t E = 0; E < S.M.tets.size(); ++E) {
-    const std::array<int, 4>& tet = S.M.tets[E];
-    const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
-    const Vec3 x = S.M.x[tet[0]];
-    Mat3 J{};
-    for (int k = 1; k < 4; ++k) J = J + outer(S.M.x[tet[k]] - x, g[k]);
-    const double N = std::max(norm2(J), DBL_MIN), sigma = det(J), square = 1 + sigma * sigma;
-    const double R = std::sqrt(sigma * sigma + 4 * delta * delta), hs = h(sigma, delta);
-    const double phi = N / (3 * std::cbrt(hs * hs)), stiffness = 2 * phi / N;
-    const double volume = volumeWeight / (2 * hs);
-    const double slope = volume * (2 * sigma - square / R) - 2. / 3 * phi / R;  // ∂/∂σ
-    const Mat3 D = stiffness * J + slope * cofactor(J);                         // ∂/∂J
-    sum.F += phi + volume * square;
-    sum.sigmaMin = std::min(sum.sigmaMin, sigma);
-    for (int k = 0; k < 4; ++k)
-      if (S.freedom[tet[k]] == 3) {
-        gradient[tet[k]] += D * g[k];
-        diagonal[tet[k]] += stiffness * norm2(g[k]);
-      }
+  for (std::size_t first = 0; first < S.M.tets.size(); first += lanes) {
+    const int count = static_cast<int>(std::min<std::size_t>(lanes, S.M.tets.size() - first));
+    Mat3 J[lanes];
+    Lanes sigma, e, r;
+    std::fill(sigma, sigma + lanes, 1.);
+    for (int i = 0; i < count; ++i) {
+      J[i] = jacobianOf(S, first + i);
+      sigma[i] = det(J[i]);
+    }
+    regularize(sigma, delta, e, r);
+    for (int i = 0; i < count; ++i) {
+      const std::array<int, 4>& tet = S.M.tets[first + i];
+      const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[first + i]];
+      const double eta = e[i] * norm2(J[i]), square = 1 + sigma[i] * sigma[i];
+      const double volume =
+          volumeWeight / 2 * (3 * e[i]) * std::sqrt(3 * e[i]);  // 1/h = (3e)^(3/2)
+      const double slope = volume * (2 * sigma[i] - square * r[i]) - 2. / 3 * eta * r[i];  // ∂/∂σ
+      const Mat3 D = (2 * e[i]) * J[i] + slope * cofactor(J[i]);  // ∂/∂J
+      sum.F += eta + volume * square;
+      sum.sigmaMin = std::min(sum.sigmaMin, sigma[i]);
+      for (int k = 0; k < 4; ++k)
+        if (S.freedom[tet[k]] == 3) {
+          gradient[tet[k]] += D * g[k];
+          diagonal[tet[k]] += 2 * e[i] * norm2(g[k]);
+        }
+    }
   }
   return sum;
 }

@@ -314,6 +314,19 @@ TEST_SUITE("3.7.4") {
     CHECK(meanEta(B) <= meanEta(A) + 1e-4);
   }
 
+  TEST_CASE("Algorithm 2: departure, a mixture that goes astray towards a flat element is undone") {
+    // One free node: the mixture after its fourth sweep would leave it at a face, where it rests.
+    Mesh M = shakenCube(2, 0);
+    M.xi.clear();
+    for (std::array<int, 4>& t : M.tets) {
+      const Vec3 o = M.x[t[0]];
+      if (dot(M.x[t[1]] - o, cross(M.x[t[2]] - o, M.x[t[3]] - o)) < 0) std::swap(t[2], t[3]);
+    }
+    for (Vec3& x : M.x)
+      if (norm(x - Vec3{.5, .5, .5}) < 1e-9) x = {.9, .8, .4};
+    CHECK(optimizeMesh(M).minQ > .7);
+  }
+
   TEST_CASE("Algorithm 2: departure, a mixture that inverts elements is undone") {
     // A coarse mesh that is hardly valid after the untangling: far steps leave the valid states.
     for (double angle : {2., 2.2}) {
