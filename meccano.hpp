@@ -213,7 +213,8 @@ struct OptimizeOptions {
   double relaxation = 1.6;
   // §3.7.4: both Wolfe conditions at inner nodes, as printed; [departure] false: the first alone
   bool strongWolfe = false;
-  // Threads that share a sweep, 0: all cores. The result is the same for every number.
+  // Threads that share a sweep, 0: all cores; the result is the same for every number. 1 here,
+  // for a host has threads of its own; the program takes all cores.
   int threads = 1;
   // [§3.7.4 departure] sweeps that Anderson's acceleration mixes; [0, 8], 0: none
   int acceleration = 4;
