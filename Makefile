@@ -6,11 +6,13 @@
 # make pictures   samples/cube_sine/*.svg       make faults  four faults in a box, samples/faults
 # make stress-real  the surfaces of ../shared/data, where it is
 # make pollutant  Section 4.3.2 on samples/layers: wind, transport, files in build/pollutant
+# make bench-optimize  the optimizer on the cases of ../shared/bench, where it is
 CXX      ?= g++
 CXXFLAGS ?= -O2 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-sign-conversion
 EXTRA    ?=
 BUILD    ?= build
 PROGRAM  ?= meccano
+CASES    ?= ../shared/bench/make_cases.py
 
 COMPILE = $(CXX) -std=c++17 $(CXXFLAGS) $(EXTRA) -ffp-contract=off -pthread
 LIBRARY = $(BUILD)/insert.o $(BUILD)/optimize.o
@@ -83,11 +85,17 @@ audit:
 	@sh tests/audit.sh
 stress bench: %: $(BUILD)/tests/%
 	$(BUILD)/tests/$@ $(ARGS)
+bench-optimize: $(BUILD)/tests/bench_optimize
+	@mkdir -p $(BUILD)/cases
+	@if [ -e $(CASES) ] && [ ! -e $(BUILD)/cases/turn_3.0.mesh ]; then \
+	  for p in python3 /usr/bin/python3; do \
+	    $$p $(CASES) $(BUILD)/cases 2>/dev/null && break; done; fi
+	$< $(BUILD)/cases $(ARGS)
 stress-real: $(BUILD)/tests/stress_real
 	$< $(ARGS)
 clean:
 	rm -rf $(BUILD) $(PROGRAM)
 
-.PHONY: all demo pictures faults test audit asan stress stress-real bench samples pollutant clean
+.PHONY: all demo pictures faults test audit asan stress stress-real bench bench-optimize samples pollutant clean
 .SECONDARY:
 -include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d $(BUILD)/*/*/*.d)

@@ -3277,6 +3277,7 @@ MesherOptions mesherOptions(const Arguments& a, Progress& progress) {
   o.maxTets = a.number("--max-tets", o.maxTets);
   o.fixedBoundary = a.has("--fixed-boundary");
   o.optimize.power = a.number("--power", o.optimize.power);
+  o.optimize.threads = a.number("--threads", 0);
   o.onProgress = [&progress](const std::string& line) { progress.line(line); };
   o.optimize.onSweep = [&progress](const Sweep& s) { progress.sweep(s); };
   return o;
@@ -3385,6 +3386,7 @@ InsertOptions insertOptions(const Arguments& a) {
   o.tolerance = a.number("--tolerance", o.tolerance);
   o.maxTets = a.number("--max-tets", o.maxTets);
   o.optimize.power = a.number("--power", o.optimize.power);
+  o.optimize.threads = a.number("--threads", 0);
   return o;
 }
 
@@ -3501,6 +3503,7 @@ OptimizeOptions optimizeOptions(const Arguments& a) {
   o.maxDisp = a.number("--max-disp", o.maxDisp);
   o.maxSweeps = a.number("--max-sweeps", o.maxSweeps);
   o.power = a.number("--power", o.power);
+  o.threads = a.number("--threads", 0);
   return o;
 }
 
@@ -3686,6 +3689,8 @@ constexpr Option outputOption{"-o", "OUT", "the mesh to write: .vtk, .msh (Gmsh)
 constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
 constexpr Option powerOption{
     "--power", "P", "exponent of the term that lifts the worst elements (default 48; 1: none)"};
+constexpr Option threadsOption{
+    "--threads", "N", "threads that smooth (default 0: all cores); the result is the same for any"};
 constexpr Option maxTetsOption{
     "--max-tets", "N", "refuse where more tetrahedra are predicted (default 20000000)"};
 constexpr Option quietOption{"--quiet", "", "no progress on standard error"};
@@ -3716,6 +3721,7 @@ const std::vector<Command>& commands() {
          "cubes of the meccano (default: near-cubic, 8 along the longer side)"},
         {"--eps", "E", "largest distance from the terrain (default: .002 of the diagonal)"},
         powerOption,
+        threadsOption,
         maxTetsOption,
         quietOption},
        runTerrain},
@@ -3734,6 +3740,7 @@ const std::vector<Command>& commands() {
         {"--polycube", "FILE", "the meccano and where its corners go"},
         {"--fixed-boundary", "", "boundary nodes stay where the boundary mapping puts them"},
         powerOption,
+        threadsOption,
         maxTetsOption,
         quietOption},
        runSolid},
@@ -3755,6 +3762,7 @@ const std::vector<Command>& commands() {
          "                       inserted faces and the surface is at most E, unit of the input"},
         paperOption,
         powerOption,
+        threadsOption,
         {"--stages", "PREFIX",
          "also write PREFIX-{original,refined,projected,smoothed}.vtk (of several surfaces\n"
          "                       PREFIX-1-refined.vtk, ...)"},
@@ -3775,6 +3783,7 @@ const std::vector<Command>& commands() {
         {"--max-sweeps", "N", "stop after this many sweeps (default 300)"},
         paperOption,
         powerOption,
+        threadsOption,
         quietOption},
        runOptimize},
       {"stats",

@@ -211,6 +211,13 @@ struct OptimizeOptions {
   double mu = 8e-3;  // h(σ_min) that δ gives, relative to the mean σ; (0, 1)
   // [§3.7.4 departure] first trial step, in Newton steps; [1, 2), 1: as printed
   double relaxation = 1.6;
+  // §3.7.4: both Wolfe conditions at inner nodes, as printed; [departure] false: the first alone
+  bool strongWolfe = false;
+  // Threads that share a sweep, 0: all cores; the result is the same for every number. 1 here,
+  // for a host has threads of its own; the program takes all cores.
+  int threads = 1;
+  // [§3.7.4 departure] sweeps that Anderson's acceleration mixes; [0, 8], 0: none
+  int acceleration = 4;
   std::vector<int> fixed = {};   // nodes that stay where they are, besides the corners
   std::vector<int> active = {};  // nodes visited in the first sweep; empty: all
   // [§2 choice] δ from each star's own σ, for meshes whose σ spans orders of magnitude

@@ -13,10 +13,12 @@ const std::vector<int> allEight{0, 1, 2, 3, 4, 5, 6, 7};
 constexpr int inner = 6;
 
 /// Eq. (9) element by element from the mesh, without a star.
-double slowF(Mesh M, Vec3 x, double delta, double power) {
+double slowF(Mesh M, Vec3 x, double delta, double power,
+             const std::vector<int>& elements = allEight) {
   M.x[inner] = x;
   double sum = 0;
-  for (const std::array<int, 4>& t : M.tets) {
+  for (int E : elements) {
+    const std::array<int, 4>& t = M.tets[E];
     const Mat3 J = jacobian({M.xi[t[0]], M.xi[t[1]], M.xi[t[2]], M.xi[t[3]]},
                             {M.x[t[0]], M.x[t[1]], M.x[t[2]], M.x[t[3]]});
     sum += std::pow(etaRegularized(J, delta), power);
@@ -59,6 +61,28 @@ TEST_SUITE("3.7.2") {
                 doctest::Approx(f(star, x, delta, power)).epsilon(1e-13));
         }
     CHECK(f(star, M.x[inner], 0) == doctest::Approx(slowF(M, M.x[inner], 0, 1)).epsilon(1e-13));
+  }
+
+  TEST_CASE("eq. (9): stars of any number of elements, though taken eight at a time") {
+    const Mesh M = shapes::unsymmetricStar();
+    std::vector<int> around;
+    for (int count = 1; count <= 19; ++count) {
+      around.push_back(count % 8);
+      const Star star = starOf(M, inner, around);
+      for (Vec3 x : {M.x[inner], Vec3{2, .5, -1}})
+        CHECK(f(star, x, .1, 3) == doctest::Approx(slowF(M, x, .1, 3, around)).epsilon(1e-12));
+    }
+  }
+
+  TEST_CASE("eq. (9): sigma over 200 orders of magnitude") {
+    const Mesh M = shapes::unsymmetricStar();
+    for (double scale : {1e-30, 1e-5, 1e8, 1e30}) {
+      Mesh scaled = M;
+      for (Vec3& x : scaled.x) x = scale * x;
+      const Star star = starOf(scaled, inner, allEight);
+      CHECK(f(star, scaled.x[inner], 0) ==
+            doctest::Approx(slowF(M, M.x[inner], 0, 1)).epsilon(1e-13));
+    }
   }
 
   TEST_CASE("eq. (9): f is infinite without regularization where an element is inverted") {

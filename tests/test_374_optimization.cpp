@@ -55,6 +55,26 @@ Mesh turnedCube(int n, int lo, int hi, double angle, std::vector<int>& block) {
   return M;
 }
 
+/// A Kuhn cube whose nodes of the plane z = .5 inside [.2, .8]² lie on a sine surface, and are to
+/// be fixed.
+Mesh raisedSheet(int n, double A, std::vector<int>& sheet) {
+  Mesh M = shakenCube(n, 0);
+  const double pi = std::acos(-1.);
+  for (std::size_t i = 0; i < M.x.size(); ++i) {
+    Vec3& x = M.x[i];
+    if (std::abs(x.z - .5) > 1e-9 || std::max(std::abs(x.x - .5), std::abs(x.y - .5)) > .3) continue;
+    x.z += A * std::sin(2 * pi * x.x) * std::sin(2 * pi * x.y);
+    sheet.push_back(static_cast<int>(i));
+  }
+  return M;
+}
+
+double meanEta(const Mesh& M) {
+  double sum = 0;
+  for (double q : qualities(M)) sum += 1 / q;
+  return sum / static_cast<double>(M.tets.size());
+}
+
 /// F with derivative for the line search; counts its calls.
 struct LineCase {
   const char* name;
@@ -276,6 +296,73 @@ TEST_SUITE("3.7.4") {
     CHECK(std::memcmp(A.x.data(), B.x.data(), sizeof(Vec3) * A.x.size()) == 0);
   }
 
+  TEST_CASE("Algorithm 2: departure, accelerated sweeps reach the same minimum in two thirds of them") {
+    std::vector<int> sheet;
+    const Mesh start = raisedSheet(16, .1, sheet);
+    REQUIRE(qualityStatistics(start).inverted > 0);
+    OptimizeOptions plain, accelerated;
+    plain.fixed = accelerated.fixed = sheet;
+    plain.power = accelerated.power = 1;
+    plain.relaxation = accelerated.relaxation = 1;
+    plain.acceleration = 0;
+    Mesh A = start, B = start;
+    const OptimizeReport slow = optimizeMesh(A, plain), fast = optimizeMesh(B, accelerated);
+    CHECK(slow.converged);
+    CHECK(fast.converged);
+    CHECK(fast.inverted == 0);
+    CHECK(3 * fast.sweeps <= 2 * slow.sweeps);
+    CHECK(meanEta(B) <= meanEta(A) + 1e-4);
+  }
+
+  TEST_CASE("Algorithm 2: departure, a mixture that goes astray towards a flat element is undone") {
+    // One free node: the mixture after its fourth sweep would leave it at a face, where it rests.
+    Mesh M = shakenCube(2, 0);
+    M.xi.clear();
+    for (std::array<int, 4>& t : M.tets) {
+      const Vec3 o = M.x[t[0]];
+      if (dot(M.x[t[1]] - o, cross(M.x[t[2]] - o, M.x[t[3]] - o)) < 0) std::swap(t[2], t[3]);
+    }
+    for (Vec3& x : M.x)
+      if (norm(x - Vec3{.5, .5, .5}) < 1e-9) x = {.9, .8, .4};
+    CHECK(optimizeMesh(M).minQ > .7);
+  }
+
+  TEST_CASE("Algorithm 2: departure, a mixture that inverts elements is undone") {
+    // A coarse mesh that is hardly valid after the untangling: far steps leave the valid states.
+    for (double angle : {2., 2.2}) {
+      std::vector<int> block;
+      Mesh M = turnedCube(8, 3, 5, angle, block);
+      OptimizeOptions options;
+      options.fixed = block;
+      options.power = 1;
+      bool valid = false;
+      options.onSweep = [&](const Sweep& sweep) {
+        if (valid) CHECK(sweep.inverted == 0);
+        valid = valid || sweep.inverted == 0;
+      };
+      CHECK(optimizeMesh(M, options).inverted == 0);
+    }
+  }
+
+  TEST_CASE("Algorithm 2: the number of threads does not change a byte") {
+    std::vector<int> block, sheet;
+    const Mesh turned = turnedCube(8, 3, 5, 2.2, block);
+    const Mesh raised = raisedSheet(12, .1, sheet);
+    for (const auto& [mesh, fixed] : {std::pair(turned, block), std::pair(raised, sheet)}) {
+      OptimizeOptions options;
+      options.fixed = fixed;
+      options.threads = 1;
+      Mesh one = mesh;
+      optimizeMesh(one, options);
+      for (int threads : {2, 5}) {
+        options.threads = threads;
+        Mesh many = mesh;
+        optimizeMesh(many, options);
+        CHECK(std::memcmp(one.x.data(), many.x.data(), sizeof(Vec3) * one.x.size()) == 0);
+      }
+    }
+  }
+
   TEST_CASE("Algorithm 2: a mesh without tetrahedra or without free nodes is left as it is") {
     Mesh none;
     CHECK(optimizeMesh(none).converged);
@@ -305,6 +392,8 @@ TEST_SUITE("3.7.4") {
     refuses("power", [](OptimizeOptions& o) { o.power = .5; });
     refuses("mu", [](OptimizeOptions& o) { o.mu = 1; });
     refuses("mu", [](OptimizeOptions& o) { o.mu = 0; });
+    refuses("acceleration", [](OptimizeOptions& o) { o.acceleration = 9; });
+    refuses("threads", [](OptimizeOptions& o) { o.threads = -1; });
     refuses("relaxation", [](OptimizeOptions& o) { o.relaxation = 2; });
     refuses("fixed node 27", [](OptimizeOptions& o) { o.fixed = {27}; });
     refuses("active node -1", [](OptimizeOptions& o) { o.active = {-1}; });
