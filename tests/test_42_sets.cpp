@@ -176,8 +176,7 @@ TEST_SUITE("4.2") {
     TriangleSurface holed = sheetAt({.5, .5, .7}, .2, 0, "");
     holed.triangles.erase(holed.triangles.begin() + 60);
     CHECK(has(refusal(M, {good, holed}, withSize(.16)), "surface 2: "));
-    const InsertOptions none;
-    CHECK(has(refusal(M, {good}, none), "l_c"));
+    CHECK(has(refusal(M, {good}, withSize(-1)), "l_c"));
     CHECK(insertSurfaces(M, {}, withSize(.16)).empty());
   }
 
