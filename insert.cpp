@@ -147,81 +147,87 @@ Vec3 gamma(const Curve& C, double s) {
 
 namespace {
 
-/// Cell of a grid along one axis.
-int gridCell(double offset, const Parametrization::Grid& G) {
-  return offset > 0 ? static_cast<int>(std::min(offset / G.cell, G.size - 1.)) : 0;
+/// Cell of the grid along one axis.
+int gridCell(double x, int size) {
+  return x > 0 ? static_cast<int>(std::min(x * size, size - 1.)) : 0;
 }
 
-/// Range of cells that the triangle's box meets, widened by rounding.
-std::array<int, 4> gridRange(const Parametrization& P, const Parametrization::Grid& G,
-                             const std::array<int, 3>& t) {
-  const double margin = 1e-6 * G.cell;  // far above rounding
-  const Vec2 a = P.u[t[0]] - G.low, b = P.u[t[1]] - G.low, c = P.u[t[2]] - G.low;
-  return {gridCell(std::min({a.x, b.x, c.x}) - margin, G),
-          gridCell(std::max({a.x, b.x, c.x}) + margin, G),
-          gridCell(std::min({a.y, b.y, c.y}) - margin, G),
-          gridCell(std::max({a.y, b.y, c.y}) + margin, G)};
-}
-
-/// Fills grid g with these triangles; crowded cells get grids of their own, their triangles in
-/// `waiting`.
-void fillGrid(Parametrization& P, std::size_t g, const std::vector<int>& triangles,
-              std::vector<std::vector<int>>& waiting) {
-  constexpr std::size_t crowded = 16;         // triangles; a vertex may well have 12
-  constexpr double smallestCell = 1e-14;      // in 𝓤, where doubles end
-  constexpr std::size_t fewerBy = 3, of = 4;  // a cell that holds nearly all is not cut again
-  P.grids[g].first = static_cast<int>(P.gridOf.size());
-  const Parametrization::Grid G = P.grids[g];
-  std::vector<std::vector<int>> cells(std::size_t(G.size) * G.size);
-  for (int t : triangles) {
-    const std::array<int, 4> r = gridRange(P, G, P.triangles[t]);
-    for (int j = r[2]; j <= r[3]; ++j)
-      for (int i = r[0]; i <= r[1]; ++i) cells[std::size_t(j) * G.size + i].push_back(t);
+/// Whether a line along one of the triangle's edges has the triangle on one side and the whole cell
+/// on the other: slivers across a grid meet few of the cells that their boxes meet.
+bool separated(const std::array<Vec2, 3>& t, Vec2 low, double cell) {
+  const Vec2 high = low + Vec2{cell, cell};
+  for (int i = 0; i < 3; ++i) {
+    const Vec2 a = t[i], d = t[(i + 1) % 3] - a;
+    const double third = cross(d, t[(i + 2) % 3] - a);
+    const double x[2] = {d.x * (low.y - a.y), d.x * (high.y - a.y)};
+    const double y[2] = {d.y * (low.x - a.x), d.y * (high.x - a.x)};
+    const double least = std::min(x[0], x[1]) - std::max(y[0], y[1]);
+    const double most = std::max(x[0], x[1]) - std::min(y[0], y[1]);
+    constexpr double rounding = 1e-14, part = 1e-6;  // of the products, of a cell: far above it
+    const double margin = rounding * (std::abs(x[0]) + std::abs(x[1]) + std::abs(y[0]) + std::abs(y[1])) +
+                          part * cell * norm(d) + rounding * std::abs(third);
+    if (most < std::min(third, 0.) - margin || least > std::max(third, 0.) + margin) return true;
   }
-  for (std::size_t c = 0; c < cells.size(); ++c) {
-    const bool worth = cells[c].size() * of < triangles.size() * fewerBy || triangles.size() > 64;
-    P.gridOf.push_back(0);
-    if (cells[c].size() > crowded && worth && G.cell > smallestCell) {
-      const int i = static_cast<int>(c) % G.size, j = static_cast<int>(c) / G.size;
-      const int size = std::max(2, static_cast<int>(std::sqrt(cells[c].size())));
-      P.gridOf.back() = static_cast<int>(P.grids.size());
-      P.grids.push_back({G.low + Vec2{i * G.cell, j * G.cell}, G.cell / size, size, 0});
-      waiting.push_back(std::move(cells[c]));
-    } else {
-      P.gridTriangles.insert(P.gridTriangles.end(), cells[c].begin(), cells[c].end());
+  return false;
+}
+
+/// The triangles of each cell of a grid over 𝓤.
+std::vector<std::vector<int>> cellsOf(const Parametrization& P) {
+  const int size = P.gridSize;
+  const double cell = 1. / size, margin = 1e-6 * cell;  // far above rounding
+  std::vector<std::vector<int>> cells(std::size_t(size) * size);
+  for (int t = 0; t < static_cast<int>(P.triangles.size()); ++t) {
+    const std::array<int, 3>& n = P.triangles[t];
+    const std::array<Vec2, 3> u{P.u[n[0]], P.u[n[1]], P.u[n[2]]};
+    const int left = gridCell(std::min({u[0].x, u[1].x, u[2].x}) - margin, size);
+    const int right = gridCell(std::max({u[0].x, u[1].x, u[2].x}) + margin, size);
+    const int bottom = gridCell(std::min({u[0].y, u[1].y, u[2].y}) - margin, size);
+    const int top = gridCell(std::max({u[0].y, u[1].y, u[2].y}) + margin, size);
+    const bool oneCell = left == right && bottom == top;
+    for (int j = bottom; j <= top; ++j)
+      for (int i = left; i <= right; ++i)
+        if (oneCell || !separated(u, cell * Vec2{double(i), double(j)}, cell))
+          cells[std::size_t(j) * size + i].push_back(t);
+  }
+  return cells;
+}
+
+constexpr int crowded = 16;  // triangles in a box that is halved; a vertex may well have 12
+
+/// Halves a run of P.gridTriangles, across the longer side of its box, down to few in a box.
+/// Returns the number of its box. The recursion is as deep as the logarithm of the run's length.
+int addBoxes(Parametrization& P, int first, int last) {
+  const int number = static_cast<int>(P.boxes.size());
+  Parametrization::Box box{{1e300, 1e300}, {-1e300, -1e300}, first, last, 0};
+  for (int i = first; i < last; ++i)
+    for (int n : P.triangles[P.gridTriangles[i]]) {
+      const Vec2 u = P.u[n];
+      box.low = {std::min(box.low.x, u.x), std::min(box.low.y, u.y)};
+      box.high = {std::max(box.high.x, u.x), std::max(box.high.y, u.y)};
     }
-    P.gridStart.push_back(static_cast<int>(P.gridTriangles.size()));
-  }
+  P.boxes.push_back(box);
+  if (last - first <= crowded) return number;
+  const bool alongX = box.high.x - box.low.x > box.high.y - box.low.y;
+  auto place = [&](int t) {
+    double sum = 0;
+    for (int n : P.triangles[t]) sum += alongX ? P.u[n].x : P.u[n].y;
+    return sum;
+  };
+  const int middle = first + (last - first) / 2;
+  const auto at = [&](int i) { return P.gridTriangles.begin() + i; };
+  std::nth_element(at(first), at(middle), at(last), [&](int s, int t) {
+    return std::make_pair(place(s), s) < std::make_pair(place(t), t);
+  });
+  addBoxes(P, first, middle);
+  const int right = addBoxes(P, middle, last);
+  P.boxes[number].right = right;
+  return number;
 }
 
-}  // namespace
-
-void buildLocator(Parametrization& P) {
-  const int count = static_cast<int>(P.triangles.size());
-  P.gridSize = std::clamp(static_cast<int>(std::sqrt(count)), 1, 1024);
-  P.grids.assign(1, {{0, 0}, 1. / P.gridSize, P.gridSize, 0});
-  P.gridOf.clear();
-  P.gridTriangles.clear();
-  P.gridStart.assign(1, 0);
-  std::vector<std::vector<int>> waiting(1, std::vector<int>(count));
-  std::iota(waiting[0].begin(), waiting[0].end(), 0);
-  for (std::size_t g = 0; g < P.grids.size(); ++g) {
-    const std::vector<int> triangles = std::move(waiting[g]);
-    fillGrid(P, g, triangles, waiting);
-  }
-}
-
-Location locate(const Parametrization& P, Vec2 u) {
-  constexpr double tolerance = 1e-9;  // barycentric: a point on the border of 𝓤 may round outside
-  int cell = 0;
-  for (int g = 0, first = 1; first || g > 0; first = 0, g = P.gridOf[cell]) {
-    const Parametrization::Grid& G = P.grids[g];
-    const Vec2 at = u - G.low;
-    cell = G.first + gridCell(at.y, G) * G.size + gridCell(at.x, G);
-  }
-  Location best{-1, {0, 0, 0}};
-  double bestInside = -tolerance;
-  for (int i = P.gridStart[cell]; i < P.gridStart[cell + 1]; ++i) {
+/// Looks for u among a run of P.gridTriangles. Returns whether it is inside one of them.
+bool locateIn(const Parametrization& P, Vec2 u, int first, int last, Location& best,
+              double& bestInside) {
+  for (int i = first; i < last; ++i) {
     const std::array<int, 3>& t = P.triangles[P.gridTriangles[i]];
     const Vec2 a = P.u[t[0]] - u, b = P.u[t[1]] - u, c = P.u[t[2]] - u;
     const double area = cross(b - a, c - a);
@@ -231,8 +237,57 @@ Location locate(const Parametrization& P, Vec2 u) {
       bestInside = inside;
       best = {P.gridTriangles[i], {w0, w1, w2}};
     }
-    if (inside >= 0) break;
+    if (inside >= 0) return true;
   }
+  return false;
+}
+
+/// As locateIn, among the triangles of a tree of boxes.
+bool locateInBoxes(const Parametrization& P, Vec2 u, int root, Location& best,
+                   double& bestInside) {
+  constexpr double part = 1e-9;  // of the box: as the tolerance of triangles
+  int waiting[64] = {root};      // the tree is less deep
+  for (int count = 1; count > 0;) {
+    const int b = waiting[--count];
+    const Parametrization::Box& box = P.boxes[b];
+    const Vec2 m = part * (box.high - box.low);
+    if (u.x < box.low.x - m.x || u.x > box.high.x + m.x || u.y < box.low.y - m.y ||
+        u.y > box.high.y + m.y)
+      continue;
+    if (box.right > 0)
+      waiting[count++] = box.right, waiting[count++] = b + 1;
+    else if (locateIn(P, u, box.first, box.last, best, bestInside))
+      return true;
+  }
+  return false;
+}
+
+}  // namespace
+
+void buildLocator(Parametrization& P) {
+  const int count = static_cast<int>(P.triangles.size());
+  P.gridSize = std::clamp(static_cast<int>(std::sqrt(count)), 1, 1024);
+  P.gridTriangles.clear();
+  P.gridStart.assign(1, 0);
+  P.boxes.clear();
+  P.boxOf.clear();
+  for (const std::vector<int>& cell : cellsOf(P)) {
+    const int first = P.gridStart.back(), last = first + static_cast<int>(cell.size());
+    P.gridTriangles.insert(P.gridTriangles.end(), cell.begin(), cell.end());
+    P.gridStart.push_back(last);
+    P.boxOf.push_back(last - first > crowded ? addBoxes(P, first, last) : -1);
+  }
+}
+
+Location locate(const Parametrization& P, Vec2 u) {
+  constexpr double tolerance = 1e-9;  // barycentric: a point on the border of 𝓤 may round outside
+  const int cell = gridCell(u.y, P.gridSize) * P.gridSize + gridCell(u.x, P.gridSize);
+  Location best{-1, {0, 0, 0}};
+  double bestInside = -tolerance;
+  if (P.boxOf[cell] < 0)
+    locateIn(P, u, P.gridStart[cell], P.gridStart[cell + 1], best, bestInside);
+  else
+    locateInBoxes(P, u, P.boxOf[cell], best, bestInside);
   if (best.triangle >= 0 && bestInside < 0) {
     double sum = 0;
     for (double& w : best.w) sum += w = std::max(w, 0.0);
@@ -1709,17 +1764,21 @@ struct Attempt {
   double mean;  // of q; -1: none yet
 };
 
-/// Mean q after the first placement of the interior, on the meccano's mesh refined a few times.
-/// [choice] An inverted element counts 0: fewest inverted elements alone, on a mesh as coarse as
-/// this, chose maps that ended with lower quality.
+/// [§2, Algorithm 1, lines 5 to 9] Refines and projects until ∂M is within eps, or has so many
+/// tetrahedra.
+void refineUpTo(Mesh& M, double eps, std::size_t mostTets);
+
+/// Mean q after the first placement of the interior, on the meccano's mesh refined to a coarse ε.
+/// [choice] An inverted element counts 0. Where Π squashes a part, the refinement that it needs runs
+/// up to the limit and its elements are flat: a mesh refined evenly does not see it.
 double meanQuality(const Meccano& C, const BoundaryMapping& Pi, std::string& text) {
-  constexpr std::size_t enough = 2500;  // [choice] elements that tell mappings apart
+  constexpr double partOfDiagonal = .01;
+  constexpr std::size_t mostTets = 15000;  // [choice] three times what a map that fits needs
   Mesh M = getInitialMesh(C, Pi);
-  while (M.tets.size() < enough) {
-    std::vector<int> all(M.tets.size());
-    std::iota(all.begin(), all.end(), 0);
-    bisect(M, all);
-  }
+  TriangleSurface all;
+  for (const Parametrization& P : Pi.patches)
+    all.points.insert(all.points.end(), P.points.begin(), P.points.end());
+  refineUpTo(M, partOfDiagonal * norm(coordinateFrame(all).size()), mostTets);
   placeInterior(M);
   const QualityStatistics q = qualityStatistics(M);
   text = std::to_string(q.inverted) + " of " + std::to_string(q.tetrahedra) +
@@ -2742,15 +2801,27 @@ void measurePatch(const Mesh& M, const std::vector<BoundaryFace>& faces, int lab
   }
 }
 
+/// The distance of the faces of elements before a refinement; those that are left keep it.
+struct KnownDistance {
+  std::vector<std::array<int, 4>> tets;
+  BoundaryDistance d;
+};
+
 /// distance(∂M, ∂Ω) with ∂Ω prepared.
-BoundaryDistance distanceTo(const Mesh& M, const CurvedBoundary& Omega, double enough) {
+BoundaryDistance distanceTo(const Mesh& M, const CurvedBoundary& Omega, double enough,
+                            const KnownDistance& known = {}) {
   BoundaryDistance result;
   result.ofFace.assign(M.tets.size(), {0, 0, 0, 0});
   std::vector<BoundaryFace> faces;
-  for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
-    for (int i = 0; i < 4; ++i)
-      if (M.faceLabel[E][i] < 0 && Omega.curved[-M.faceLabel[E][i] - 1])
-        faces.push_back(boundaryFace(M, {E, i}));
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    const bool isKnown = E < known.tets.size() && known.tets[E] == M.tets[E];
+    if (isKnown) result.ofFace[E] = known.d.ofFace[E];
+    for (int i = 0; i < 4; ++i) {
+      if (M.faceLabel[E][i] >= 0 || !Omega.curved[-M.faceLabel[E][i] - 1]) continue;
+      if (!isKnown) faces.push_back(boundaryFace(M, {static_cast<int>(E), i}));
+      if (isKnown) result.toSolid = std::max(result.toSolid, known.d.ofFace[E][i]);
+    }
+  }
   for (const BoundaryFace& face : faces) {
     const FaceDistance d = sampledFace(M, face, Omega, enough);
     result.ofFace[face.at.E][face.at.i] = std::max(d.toSolid, d.toFace);
@@ -2773,6 +2844,10 @@ BoundaryDistance distance(const Mesh& M, double enough) {
 
 TriangleList getTrianglesToRefine(const Mesh& M, const BoundaryDistance& d, double eps) {
   TriangleList tau;
+  if (d.ofFace.size() != M.tets.size())
+    throw InputError("getTrianglesToRefine (§2): the distance is of " +
+                     std::to_string(d.ofFace.size()) + " tetrahedra, the mesh has " +
+                     std::to_string(M.tets.size()) + "; measure the distance of this mesh");
   for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
     for (int i = 0; i < 4; ++i)
       if (d.ofFace[E][i] > eps) tau.push_back({E, i});
@@ -2804,6 +2879,23 @@ void projectNewNodesToBoundary(Mesh& M, const TriangleList& tauNew) {
       if (M.dimension[n] == 1) M.x[n] = gamma(M.curves[M.entity[n] - 1], M.parameter[n].x);
     }
 }
+
+namespace {
+
+void refineUpTo(Mesh& M, double eps, std::size_t mostTets) {
+  constexpr int maxPasses = 100;  // the limit of tetrahedra comes first
+  const CurvedBoundary Omega = curvedBoundary(M);
+  Bisection B(M);
+  KnownDistance known;
+  for (int pass = 0; pass < maxPasses && M.tets.size() < mostTets; ++pass) {
+    known.d = distanceTo(M, Omega, eps, known);
+    known.tets = M.tets;
+    if (known.d.largest() <= eps) return;
+    projectNewNodesToBoundary(M, refineTriangles(B, getTrianglesToRefine(M, known.d, eps)));
+  }
+}
+
+}  // namespace
 
 // ==== 2. Algorithm 1: quality optimization =======================================================
 
@@ -2883,8 +2975,11 @@ int refineToDistance(Mesher& W, double eps) {
   constexpr int mostLevels = 90;             // [choice] 2^30 edges along one of a cube
   constexpr int maxPasses = 3 * mostLevels;  // a bisection need not split the face itself
   Bisection B(W.M);
+  KnownDistance known;
   for (int pass = 0; pass < maxPasses; ++pass) {
-    const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
+    known.d = distanceTo(W.M, W.Omega, eps, known);
+    known.tets = W.M.tets;
+    const BoundaryDistance& d = known.d;
     if (d.largest() <= eps) return pass;
     const double predicted = predictedTets(W.M, d, eps);
     if (predicted > W.options.maxTets)
@@ -3070,7 +3165,7 @@ MesherReport meccanoMesher(Mesh& M, const TriangleSurface& Omega, const MesherOp
   const BoundaryMapping Pi = getBoundaryMapping(D, solid);
   if (options.onProgress) {
     options.onProgress("meccano: " + counted(D.cubes.size(), "cube") + ", " +
-                       counted(Pi.patches.size(), "patch") + ", " +
+                       std::to_string(Pi.patches.size()) + " patches, " +
                        counted(Pi.curves.size(), "patch edge"));
     for (const std::string& note : Pi.notes) options.onProgress(note);
   }

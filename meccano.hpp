@@ -121,18 +121,18 @@ struct Parametrization {
   std::vector<Vec2> u;                        // [points], in 𝓤 (the unit square)
   std::string name = {};
   int rim = 0;  // number of its rim among Mesh::curves; 0: a boundary patch
-  // Grids for the point location, derived data made by buildLocator(). The first is over 𝓤; where
-  // the map crowds triangles into a cell, that cell has a grid of its own.
-  int gridSize = 0;  // of the first grid along each axis; 0: not made
-  struct Grid {
-    Vec2 low;
-    double cell;      // edge of a cell
-    int size, first;  // along each axis; cells first .. first + size²
-  };
-  std::vector<Grid> grids;
-  std::vector<int> gridOf;  // [cells of all grids], number of the grid over a cell, 0: none
+  // Grid for the point location over 𝓤, derived data made by buildLocator(). Where the map crowds
+  // triangles into a cell, that cell has a tree of boxes, each of them halved in two.
+  int gridSize = 0;  // cells along each axis; 0: not made
   // Triangles of cell c: gridTriangles[gridStart[c] .. gridStart[c+1]).
   std::vector<int> gridStart, gridTriangles;
+  struct Box {
+    Vec2 low, high;
+    int first, last, right;  // a run of gridTriangles; its halves are the next box and `right`, 0:
+                             // not halved
+  };
+  std::vector<Box> boxes;
+  std::vector<int> boxOf;  // [cells], the box of its tree's root, -1: none
 };
 
 /// [§3.7.3] A curve γ(s) by arc length: the rim of an inserted surface, or an edge of the boundary.
