@@ -87,7 +87,7 @@ Field hill(const Domain& D) {
 /// Nothing but advection.
 Settings advection() {
   Settings s;
-  s.Kh = s.Kv = s.deposition = 0;
+  s.K = {0, 0}, s.deposition = 0;
   s.limit = false;
   return s;
 }
@@ -226,7 +226,7 @@ TEST_SUITE("4.3.2") {
     const Domain D = domain(flat, {8, 8, 8});
     const Wind W = swirl(D);
     Settings s = advection();
-    s.Kh = s.Kv = 50, s.decay = 1e-4;
+    s.K = {50, 50}, s.decay = 1e-4;
     const double time = 4 * courantStep(D, W.u);
     auto after = [&](int steps) {
       const Transport P(D, W, {}, time / steps, s);
@@ -244,7 +244,7 @@ TEST_SUITE("4.3.2") {
   TEST_CASE("transport: deposition and decay alone follow their exponentials") {
     const Domain D = domain(flat, {2, 2, 4}, 0);
     Settings s = advection();
-    s.Kh = s.Kv = 1e7;  // well mixed
+    s.K = {1e7, 1e7};  // well mixed
     s.deposition = .5;
     const double dt = 20, H = 4000;
     Balance balance;
@@ -265,7 +265,7 @@ TEST_SUITE("4.3.2") {
     const Domain D = domain(island, {14, 14, 12});
     Settings s;
     s.end = 1800;
-    const Wind W = massConsistentWind(D, logarithmicWind(D, s), s.ah, s.av);
+    const Wind W = massConsistentWind(D, logarithmicWind(D, s), s.a[0], s.a[1]);
     const std::vector<int> source = sourceNodes(D, W, s);
     double least = 0, plainLeast = 0, flow = 0;
     std::ostringstream progress;
