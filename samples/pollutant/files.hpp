@@ -157,6 +157,41 @@ inline Nodes readVtk(const std::string& name) {
   throw InputError(name + ": no cell data `surface`: this is not a meccano .vtk");
 }
 
+// ==== Meshes and their layers ====================================================================
+
+inline Nodes nodesOf(const meccano::Mesh& M) {
+  Nodes G{M.x, M.tets, {}};
+  for (const std::array<int, 4>& labels : M.faceLabel)
+    for (int k : labels)
+      if (k != 0 && G.faces.count(k) == 0) G.faces[k] = meccano::surfaceFaces(M, k);
+  return G;
+}
+
+/// Heights above the terrain: of its triangles the one below; beside the terrain its nearest point.
+inline Field heightsAbove(const std::vector<Vec3>& x, const std::vector<Triangle>& terrain) {
+  constexpr double slack = 1e-9, reach = 1e300;  // barycentric; the column above and below a node
+  const meccano::TriangleTree tree(x, terrain);
+  Field height(x.size());
+  for (std::size_t n = 0; n < x.size(); ++n) {
+    const Vec3 p = x[n];
+    double ground = noValue;
+    tree.visit({p.x, p.y, -reach}, {p.x, p.y, reach}, [&](int t) {
+      const Vec3 a = x[terrain[t][0]], b = x[terrain[t][1]] - a, c = x[terrain[t][2]] - a;
+      const Vec2 d{p.x - a.x, p.y - a.y};
+      const double area = cross(Vec2{b.x, b.y}, Vec2{c.x, c.y});
+      const double v = cross(d, Vec2{c.x, c.y}) / area, w = cross(Vec2{b.x, b.y}, d) / area;
+      if (!(v >= -slack && w >= -slack && v + w <= 1 + slack)) return false;
+      ground = a.z + v * b.z + w * c.z;
+      return true;
+    });
+    height[n] = p.z - (std::isnan(ground) ? tree.closest(p).point.z : ground);
+    height[n] = std::max(height[n], 0.);
+  }
+  for (const Triangle& t : terrain)
+    for (int n : t) height[n] = 0;
+  return height;
+}
+
 // ==== Out =======================================================================================
 
 struct Output {
@@ -503,13 +538,17 @@ inline double partAbove(std::array<double, 3> v, double level) {
                        : high * high / (all * (v[2] - v[1]));
 }
 
+inline double areaOf(const Nodes& D, const Triangle& t) {
+  return norm(cross(D.x[t[1]] - D.x[t[0]], D.x[t[2]] - D.x[t[0]])) / 2;
+}
+
 /// A line of the table: mean, maximum, the area with a tenth of the source's concentration or more,
 /// and how far along the wind half of it has come on the layer.
 inline std::string layerRow(const Nodes& D, int layer, const Moment& at, Vec3 along,
                             double concentration) {
   double mean = 0, most = 0, covered = 0, area = 0, from = 1e300, to = -1e300, front = -1e300;
   for (const Triangle& t : D.faces.at(layer)) {
-    const double size = norm(cross(D.x[t[1]] - D.x[t[0]], D.x[t[2]] - D.x[t[0]])) / 2;
+    const double size = areaOf(D, t);
     const std::array<double, 3> v{at.c[t[0]], at.c[t[1]], at.c[t[2]]};
     mean += size * (v[0] + v[1] + v[2]) / 3, area += size;
     covered += size * partAbove(v, concentration / 10);
@@ -536,7 +575,8 @@ struct Option {
   enum Range { any, from0, above0 };
   std::string name, values, help;
   Range range;
-  std::vector<double*> to;
+  double* to;
+  int count = 1;
 };
 
 struct Words {
@@ -567,7 +607,7 @@ inline Words parseWords(const std::vector<std::string>& arguments,
     const auto option = std::find_if(options.begin(), options.end(),
                                      [&](const Option& o) { return o.name == word; });
     if (option != options.end())
-      for (double* to : option->to) parseNumber(*option, next(), *to);
+      for (int k = 0; k < option->count; ++k) parseNumber(*option, next(), option->to[k]);
     else if (word == "-o")
       words.folder = next();
     else if (word == "--no-limit")

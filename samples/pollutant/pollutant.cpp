@@ -26,26 +26,89 @@ using meccano::SparseMatrix;
 
 struct Settings {
   double wind = 4, from = 90, roughness = .1;    // m/s at 10 m; degrees, 90: from the east; z0, m
-  double ah = 1, av = 1;                         // of the wind's adjustment
-  double Kh = 10, Kv = 5;                        // diffusion K = diag(Kh, Kh, Kv), m^2/s
+  std::array<double, 2> a{1, 1};                 // a_h, a_v of the wind's adjustment
+  std::array<double, 2> K{10, 5};                // diffusion K = diag(K0, K0, K1), m^2/s
   double deposition = .5, decay = 0;             // V_d, m/s; 1/s
   double concentration = .5;                     // of the source, g/m^3
-  std::vector<double> source = {};               // x0 x1 y0 y1 z0 z1; empty: see sourceNodes()
+  std::array<double, 6> source{noValue};         // x0 x1 y0 y1 z0 z1; NaN: see Region
   double dt = 1e300, end = 3600;                 // s; the element Courant number stays <= 1 as well
   std::vector<double> outputs{300, 1800, 3600};  // s, as far as they are before the end
   bool limit = true;                             // see Transport::limit()
   double top = 8000, eps = 0, lc = 0;            // of a mesh made here, m
-  std::vector<double> cells{0, 0, 0};  // its cubes; 0: near-cubic, 8 along the longer side
+  std::array<double, 3> cells{0, 0, 0};  // its cubes; 0: near-cubic, 8 along the longer side
 };
 
 // ==== 1. The mesh ===============================================================================
 
-Nodes nodesOf(const Mesh& M) {
-  Nodes G{M.x, M.tets, {}};
-  for (const std::array<int, 4>& labels : M.faceLabel)
-    for (int k : labels)
-      if (k != 0 && G.faces.count(k) == 0) G.faces[k] = meccano::surfaceFaces(M, k);
-  return G;
+/// The unit vector the wind blows along; `from` counts degrees from the north, y, to the east, x.
+Vec3 windDirection(const Settings& s) {
+  const double angle = s.from * (3.14159265358979323846 / 180);
+  return {-std::sin(angle), -std::cos(angle), 0};
+}
+
+/// Where on the sides the pollutant enters: the box of the settings. [choice] Without one: the
+/// middle third of the width the wind meets, up to midway between the two lowest layers (half above
+/// a single one), so that the lower layer lies in the plume and the upper one above it.
+struct Region {
+  Vec3 e1{1, 0, 0}, e2{0, 1, 0};  // the first two coordinates
+  bool aboveGround = false;       // the third is not z, but the height above ground
+  Vec3 from, to;
+
+  /// `level`: mean heights above ground of the layers, the lowest first.
+  Region(const std::vector<Vec3>& x, const Field& level, const Settings& s) {
+    if (const std::array<double, 6>& b = s.source; !std::isnan(b[0])) {
+      from = {b[0], b[2], b[4]}, to = {b[1], b[3], b[5]};
+      return;
+    }
+    constexpr double unbounded = 1e300;
+    e2 = windDirection(s), e1 = {e2.y, -e2.x, 0}, aboveGround = true;
+    double lo = unbounded, hi = -unbounded;
+    for (Vec3 p : x) lo = std::min(lo, dot(e1, p)), hi = std::max(hi, dot(e1, p));
+    from = {(2 * lo + hi) / 3, -unbounded, -unbounded};
+    to = {(lo + 2 * hi) / 3, unbounded,
+          level.size() > 1 ? (level[0] + level[1]) / 2 : 1.5 * level[0]};
+  }
+  Vec3 at(Vec3 p, double height) const {
+    return {dot(e1, p), dot(e2, p), aboveGround ? height : p.z};
+  }
+  /// Whether it meets the box from a to b.
+  bool meets(Vec3 a, Vec3 b) const {
+    return a.x <= to.x && a.y <= to.y && a.z <= to.z && b.x >= from.x && b.y >= from.y &&
+           b.z >= from.z;
+  }
+};
+
+/// [choice] Bisects the sides' faces that meet the source, where the wind blows in, until their
+/// edges are at most l_c: the cubes of the terrain's box may have no node between the ground and
+/// the lower layer, and what the source lets in would depend on where its nodes happen to be.
+void refineSource(Mesh& M, const meccano::Terrain& terrain, const Field& level, const Settings& s) {
+  constexpr int bound = 60;  // rounds: three halve the edges, 2^20 to 1 is beyond any terrain
+  const Region source(M.x, level, s);
+  const Vec3 along = windDirection(s);
+  std::vector<int> coarse{0};
+  for (int round = 0; round < bound && !coarse.empty(); ++round) {
+    coarse.clear();
+    for (std::size_t E = 0; E < M.tets.size(); ++E)
+      for (int i = 0; i < 4; ++i) {
+        const int label = M.faceLabel[E][i];  // -1 .. -4: x-, x+, y-, y+
+        if (label >= 0 || label < -4 ||
+            (label % 2 != 0 ? 1 : -1) * (label >= -2 ? along.x : along.y) <= 0)
+          continue;
+        Vec3 a{1e300, 1e300, 1e300}, b = -a;
+        double longest = 0;
+        for (int j = 1; j < 4; ++j) {
+          const Vec3 p = M.x[M.tets[E][(i + j) % 4]], next = M.x[M.tets[E][(i + j % 3 + 1) % 4]];
+          const Vec3 q = source.at(p, p.z - heightAt(terrain, p.x, p.y));
+          a = {std::min(a.x, q.x), std::min(a.y, q.y), std::min(a.z, q.z)};
+          b = {std::max(b.x, q.x), std::max(b.y, q.y), std::max(b.z, q.z)};
+          longest = std::max(longest, norm(next - p));
+        }
+        if (longest > s.lc && source.meets(a, b)) coarse.push_back(static_cast<int>(E));
+      }
+    std::sort(coarse.begin(), coarse.end());
+    coarse.erase(std::unique(coarse.begin(), coarse.end()), coarse.end());
+    meccano::bisect(M, coarse);
+  }
 }
 
 /// [Section 4.3.1] The terrain's box by Algorithm 1, the layers inserted one after the other.
@@ -63,7 +126,15 @@ Nodes islandMesh(const std::vector<std::string>& files, const Settings& s, std::
   options.lc = s.lc;
   options.onProgress = tell;
   std::vector<meccano::TriangleSurface> layers;
-  for (std::size_t i = 1; i < files.size(); ++i) layers.push_back(readObj(files[i]));
+  Field level;
+  for (std::size_t i = 1; i < files.size(); ++i) {
+    layers.push_back(readObj(files[i]));
+    level.push_back(0);
+    for (Vec3 p : layers.back().points)
+      level.back() +=
+          (p.z - heightAt(terrain, p.x, p.y)) / static_cast<double>(layers.back().points.size());
+  }
+  refineSource(M, terrain, level, s);
   insertSurfaces(M, layers, options);
   return nodesOf(M);
 }
@@ -80,31 +151,6 @@ struct Domain : Nodes {
 
   explicit Domain(Nodes nodes);
 };
-
-/// Heights above the terrain: of its triangles the one below; beside the terrain its nearest point.
-Field heightsAbove(const std::vector<Vec3>& x, const std::vector<Triangle>& terrain) {
-  constexpr double slack = 1e-9, reach = 1e300;  // barycentric; the column above and below a node
-  const meccano::TriangleTree tree(x, terrain);
-  Field height(x.size());
-  for (std::size_t n = 0; n < x.size(); ++n) {
-    const Vec3 p = x[n];
-    double ground = noValue;
-    tree.visit({p.x, p.y, -reach}, {p.x, p.y, reach}, [&](int t) {
-      const Vec3 a = x[terrain[t][0]], b = x[terrain[t][1]] - a, c = x[terrain[t][2]] - a;
-      const Vec2 d{p.x - a.x, p.y - a.y};
-      const double area = cross(Vec2{b.x, b.y}, Vec2{c.x, c.y});
-      const double v = cross(d, Vec2{c.x, c.y}) / area, w = cross(Vec2{b.x, b.y}, d) / area;
-      if (!(v >= -slack && w >= -slack && v + w <= 1 + slack)) return false;
-      ground = a.z + v * b.z + w * c.z;
-      return true;
-    });
-    height[n] = p.z - (std::isnan(ground) ? tree.closest(p).point.z : ground);
-    height[n] = std::max(height[n], 0.);
-  }
-  for (const Triangle& t : terrain)
-    for (int n : t) height[n] = 0;
-  return height;
-}
 
 Domain::Domain(Nodes nodes) : Nodes(std::move(nodes)), lateral(x.size(), 0), open(x.size(), 0) {
   if (!faces.count(terrainLabel))
@@ -203,12 +249,6 @@ struct Wind {
   int iterations = 0;
 };
 
-/// The unit vector the wind blows along; `from` counts degrees from the north, y, to the east, x.
-Vec3 windDirection(const Settings& s) {
-  const double angle = s.from * (3.14159265358979323846 / 180);
-  return {-std::sin(angle), -std::cos(angle), 0};
-}
-
 /// u0 = u*/κ ln((z + z0)/z0) above ground, at the centroids. [choice] u* such that |u0| is the
 /// given speed at 10 m, the height at which winds are measured.
 std::vector<Vec3> logarithmicWind(const Domain& D, const Settings& s) {
@@ -271,35 +311,20 @@ std::vector<char> inflowNodes(const Domain& D, const Wind& W) {
   return inflow;
 }
 
-/// Where the pollutant enters: the inflow nodes of the sides in the box of the settings.
-/// [choice] Without a box: the middle third of the width the wind meets, up to midway between the
-/// two lowest layers (half above a single one), so that the lower layer lies in the plume and the
-/// upper one above it.
+/// Where the pollutant enters: the inflow nodes of the sides in the source's region.
 std::vector<int> sourceNodes(const Domain& D, const Wind& W, const Settings& s) {
-  std::vector<int> inside, nodes;
+  Field level;
+  for (int k = 1; k <= D.layers; ++k) {
+    level.push_back(0);
+    for (const Triangle& t : D.faces.at(k))
+      level.back() += D.height[t[0]] / static_cast<double>(D.faces.at(k).size());
+  }
+  const Region region(D.x, level, s);
   const std::vector<char> inflow = inflowNodes(D, W);
-  const Vec3 along = windDirection(s);
-  const Vec2 across{along.y, -along.x};
-  double lo = 1e300, hi = -1e300;
-  for (Vec3 p : D.x) {
-    lo = std::min(lo, dot(across, {p.x, p.y}));
-    hi = std::max(hi, dot(across, {p.x, p.y}));
-  }
-  std::array<double, 2> level{0, 0};  // mean heights of the layers above the terrain
-  for (int k = 0; k < 2; ++k) {
-    const std::vector<Triangle>& layer = D.faces.at(std::min(k + 1, D.layers));
-    for (const Triangle& t : layer) level[k] += D.height[t[0]] / static_cast<double>(layer.size());
-  }
-  const double top = D.layers > 1 ? (level[0] + level[1]) / 2 : 1.5 * level[0];
+  std::vector<int> inside, nodes;
   for (std::size_t n = 0; n < D.x.size(); ++n) {
-    if (!D.lateral[n]) continue;
-    const Vec3 p = D.x[n];
-    const double place = (dot(across, {p.x, p.y}) - lo) / (hi - lo);
-    const std::vector<double>& b = s.source;
-    if (b.empty()
-            ? place < 1. / 3 || place > 2. / 3 || D.height[n] > top
-            : p.x < b[0] || p.x > b[1] || p.y < b[2] || p.y > b[3] || p.z < b[4] || p.z > b[5])
-      continue;
+    const Vec3 p = region.at(D.x[n], D.height[n]);
+    if (!D.lateral[n] || !region.meets(p, p)) continue;
     inside.push_back(static_cast<int>(n));
     if (inflow[n]) nodes.push_back(static_cast<int>(n));
   }
@@ -351,8 +376,8 @@ struct Transport {
   std::vector<char> fixed;  // [nodes], 1 clean inflow, 2 source
   Field value;              // there
   Field m, mTerrain;        // ∫ N_i over the volume, over the terrain
-  SparseMatrix mass, A, B,
-      inner;  // M, left and right side, the left one with identity rows where fixed
+  SparseMatrix mass, A, B;  // M, left and right side
+  SparseMatrix inner;       // A with identity rows where fixed
   Factor L;
 
   Transport(const Domain& domain, const Wind& W, const std::vector<int>& source, double step,
@@ -382,8 +407,8 @@ Transport::Transport(const Domain& domain, const Wind& W, const std::vector<int>
     for (int i = 0; i < 4; ++i)
       for (int j = 0; j < 4; ++j) {
         const double M = V / 20 * (i == j ? 2 : 1), C = V / 4 * a[j], CT = V / 4 * a[i];
-        const double S = V * a[i] * a[j],
-                     K = V * dot(D.grad[E][i], scaled({s.Kh, s.Kh, s.Kv}, D.grad[E][j]));
+        const double S = V * a[i] * a[j];
+        const double K = V * dot(D.grad[E][i], scaled({s.K[0], s.K[0], s.K[1]}, D.grad[E][j]));
         entry(mass, D.tets[E][i], D.tets[E][j]) += M;
         entry(A, D.tets[E][i], D.tets[E][j]) +=
             M * (1 + dt * s.decay) + dt / 2 * (C + CT) + dt * dt / 4 * S + dt * K;
@@ -391,7 +416,7 @@ Transport::Transport(const Domain& domain, const Wind& W, const std::vector<int>
       }
   }
   for (const Triangle& t : D.faces.at(terrainLabel)) {
-    const double area = norm(cross(D.x[t[1]] - D.x[t[0]], D.x[t[2]] - D.x[t[0]])) / 2;
+    const double area = areaOf(D, t);
     for (int i : t) mTerrain[i] += area / 3;
     for (int i : t)
       for (int j : t) entry(A, i, j) += dt * s.deposition * area / 12 * (i == j ? 2 : 1);
@@ -439,8 +464,7 @@ void Transport::limit(Field& c, double most) const {
           flux(i, mass.column[e], mass.value[e] * (c[i] - c[mass.column[e]]));
   };
   forPairs([&](std::size_t i, int, double f) { low[i] -= f / m[i], (f > 0 ? up : down)[i] += f; });
-  for (std::size_t i = 0; i < c.size();
-       ++i) {  // the parts of the fluxes up and down that node i bears
+  for (std::size_t i = 0; i < c.size(); ++i) {  // parts of the fluxes that node i bears
     up[i] = up[i] > 0 ? std::clamp(m[i] * (most - low[i]) / up[i], 0., 1.) : 1;
     down[i] = down[i] < 0 ? std::clamp(m[i] * (0 - low[i]) / down[i], 0., 1.) : 1;
   }
@@ -639,30 +663,23 @@ std::vector<Snapshot> simulate(const Domain& D, const Wind& W, const std::vector
 
 std::vector<Option> optionsFor(Settings& s) {
   const Option::Range above = Option::above0, from0 = Option::from0, any = Option::any;
-  std::vector<double>& b = s.source;
-  return {{"--wind", "U", "wind 10 m above ground, m/s (4)", above, {&s.wind}},
-          {"--from", "DEGREES", "where it comes from: 0 north, 90 east (90)", any, {&s.from}},
-          {"--roughness", "Z0", "of its logarithmic profile, m (.1)", above, {&s.roughness}},
-          {"--stability", "AH AV", "a_h, a_v of its adjustment (1 1)", above, {&s.ah, &s.av}},
-          {"--diffusion", "KH KV", "horizontal, vertical, m^2/s (10 5)", from0, {&s.Kh, &s.Kv}},
-          {"--deposition", "VD", "dry deposition velocity, m/s (.5)", from0, {&s.deposition}},
-          {"--decay", "RATE", "of first order, 1/s (0)", from0, {&s.decay}},
-          {"--concentration", "C", "at the source, g/m^3 (.5)", above, {&s.concentration}},
-          {"--source",
-           "X0 X1 Y0 Y1 Z0 Z1",
-           "the sides' inflow within a box (a third of the sea's)",
-           any,
-           {&b[0], &b[1], &b[2], &b[3], &b[4], &b[5]}},
-          {"--dt", "S", "longest time step, s (Courant number 1)", above, {&s.dt}},
-          {"--end", "S", "time simulated, s (3600)", above, {&s.end}},
-          {"--top", "Z", "top of the box above a terrain, m (8000)", any, {&s.top}},
-          {"--cells",
-           "NX NY NZ",
-           "cubes of that box (8 along its longer side)",
-           above,
-           {&s.cells[0], &s.cells[1], &s.cells[2]}},
-          {"--eps", "E", "distance from the terrain, m (.002 of the diagonal)", above, {&s.eps}},
-          {"--lc", "L", "l_c of the layers, m", above, {&s.lc}}};
+  return {{"--wind", "U", "wind 10 m above ground, m/s (4)", above, &s.wind},
+          {"--from", "DEGREES", "where it comes from: 0 north, 90 east (90)", any, &s.from},
+          {"--roughness", "Z0", "of its logarithmic profile, m (.1)", above, &s.roughness},
+          {"--stability", "AH AV", "a_h, a_v of its adjustment (1 1)", above, s.a.data(), 2},
+          {"--diffusion", "KH KV", "horizontal, vertical, m^2/s (10 5)", from0, s.K.data(), 2},
+          {"--deposition", "VD", "dry deposition velocity, m/s (.5)", from0, &s.deposition},
+          {"--decay", "RATE", "of first order, 1/s (0)", from0, &s.decay},
+          {"--concentration", "C", "at the source, g/m^3 (.5)", above, &s.concentration},
+          {"--source", "X0 X1 Y0 Y1 Z0 Z1", "box around it (a third of the sea's side)", any,
+           s.source.data(), 6},
+          {"--dt", "S", "longest time step, s (Courant number 1)", above, &s.dt},
+          {"--end", "S", "time simulated, s (3600)", above, &s.end},
+          {"--top", "Z", "top of the box above a terrain, m (8000)", any, &s.top},
+          {"--cells", "NX NY NZ", "cubes of that box (8 along its longer side)", above,
+           s.cells.data(), 3},
+          {"--eps", "E", "distance from the terrain, m (.002 of the diagonal)", above, &s.eps},
+          {"--lc", "L", "l_c of the layers, m", above, &s.lc}};
 }
 
 constexpr const char* usage =
@@ -678,7 +695,7 @@ void runSimulation(const Settings& s, const Words& words, std::ostream& out,
                    std::ostream& progress) {
   const bool isMesh = words.operands.size() == 1;
   const Domain D(isMesh ? readVtk(words.operands[0]) : islandMesh(words.operands, s, progress));
-  const Wind W = massConsistentWind(D, logarithmicWind(D, s), s.ah, s.av);
+  const Wind W = massConsistentWind(D, logarithmicWind(D, s), s.a[0], s.a[1]);
   const std::vector<int> source = sourceNodes(D, W, s);
   const std::string folder = checkFolder(words.folder);
   progress << format("%zu tetrahedra, %zu nodes, %d layers; wind: %d iterations\n", D.tets.size(),
@@ -710,11 +727,9 @@ void runSimulation(const Settings& s, const Words& words, std::ostream& out,
 int run(const std::vector<std::string>& arguments, std::ostream& out, std::ostream& err) {
   try {
     Settings s;
-    s.source.assign(6, noValue);
     const std::vector<Option> options = optionsFor(s);
     const Words words = parseWords(arguments, options);
     if (words.help) return out << helpText(usage, options), 0;
-    if (std::isnan(s.source[0])) s.source.clear();
     s.limit = !words.noLimit;
     if (words.operands.empty()) throw UsageError("name a mesh, or a terrain and its layers");
     if (words.operands.size() > 1 && !(s.lc > 0)) throw UsageError("layers need --lc");
