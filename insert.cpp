@@ -4013,12 +4013,11 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
   const Width rim = rimWidth(S, rimApart * largest / root3);
   limit("the width between parts of the rim of S", rim.distance, perRim, rim.place);
   size.lc = std::max(size.lc, size.finest);
-  // cubes are halved from the cell down: l_c just below a cube's diagonal has four times as many
-  const double cell = std::cbrt(M.cube.x * M.cube.y * M.cube.z), area = areaOf(S.S);
+  // l_c just below the diagonal of a cube has four times as many tetrahedra: the diagonal instead
   const int level = cubeLevel(M, size.lc);
-  const double h = cell * std::exp2(-level / 3);
-  if (level > 0 && predictedTets(area, h) > mostTets)
-    size.lc = size.finest = std::ldexp(norm(M.cube), 1 - level / 3) * aboveDiagonal;
+  const double diagonal = norm(M.cube) * std::exp2(-level / 3);
+  if (predictedTets(areaOf(S.S), diagonal / root3) > mostTets && 2 * diagonal < largest)
+    size.lc = size.finest = 2 * diagonal * aboveDiagonal;
 
   const Gap boundary = smallestGap(S.tree, M.x, patchFaces(M));
   limit("the distance of S to the boundary", boundary.distance, perBoundary, boundary.point);
