@@ -3810,17 +3810,18 @@ bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
 }
 
 /// Largest distance of points of A, a lattice of `least` steps on each triangle or of more that are
-/// no longer than `spacing`, from B.
-double sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing) {
+/// no longer than `spacing`, from B, and the point.
+Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing) {
   constexpr double mostSteps = 1000;
-  double largest = 0;
+  Width largest{0, {}};
   for (const std::array<Vec3, 3>& c : A.corners) {
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
     for (int i = 0; i <= m; ++i)
       for (int j = 0; i + j <= m; ++j) {
         const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
-        largest = std::max(largest, B.closest(p).distance);
+        const double distance = B.closest(p).distance;
+        if (distance > largest.distance) largest = {distance, p};
       }
   }
   return largest;
@@ -3944,12 +3945,18 @@ Width rimWidth(const SurfaceDistance& S, double apart) {
   return lowQuantile(std::move(widths));
 }
 
-double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
-                         double spacing) {
+Width farthestPoint(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
+                    double spacing) {
   if (A.nodes.empty() || B.nodes.empty() || samplesPerEdge < 1 || !(spacing > 0))
     throw InputError("hausdorffDistance: give two surfaces with triangles and samplesPerEdge >= 1");
-  return std::max(sampledDistance(A, B, samplesPerEdge, spacing),
-                  sampledDistance(B, A, samplesPerEdge, spacing));
+  const Width ofA = sampledDistance(A, B, samplesPerEdge, spacing);
+  const Width ofB = sampledDistance(B, A, samplesPerEdge, spacing);
+  return ofA.distance < ofB.distance ? ofB : ofA;
+}
+
+double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
+                         double spacing) {
+  return farthestPoint(A, B, samplesPerEdge, spacing).distance;
 }
 
 // ==== Tools for 3.2: triangle–tetrahedron intersection ===========================================
@@ -4070,6 +4077,8 @@ double areaOf(const TriangleSurface& S) {
   return area;
 }
 
+constexpr double aboveDiagonal = 1 + 1e-9;  // eq. (1) refines where r^E >= l_c
+
 /// [choice] Tetrahedra that S adds at cubes of edge h: measured 36 to 55 per face of a cube.
 double predictedTets(double area, double h) {
   constexpr double tetsPerSquare = 45;
@@ -4099,6 +4108,11 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
   const Width rim = rimWidth(S, rimApart * largest / root3);
   limit("the width between parts of the rim of S", rim.distance, perRim, rim.place);
   size.lc = std::max(size.lc, size.finest);
+  // l_c just below the diagonal of a cube has four times as many tetrahedra: the diagonal instead
+  const int level = cubeLevel(M, size.lc);
+  const double diagonal = norm(M.cube) * std::exp2(-level / 3);
+  if (predictedTets(areaOf(S.S), diagonal / root3) > mostTets && 2 * diagonal < largest)
+    size.lc = size.finest = 2 * diagonal * aboveDiagonal;
 
   const Gap boundary = smallestGap(S.tree, M.x, patchFaces(M));
   limit("the distance of S to the boundary", boundary.distance, perBoundary, boundary.point);
@@ -6190,7 +6204,8 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
              number(report.smoothed.min) + ", mean " + number(report.smoothed.mean));
   if (report.smoothed.inverted > 0)
     throw MethodError("insertSurface (§3.7): " + std::to_string(report.smoothed.inverted) +
-                      " elements stay inverted");
+                      " elements stay inverted, of " + std::to_string(report.projected.inverted) +
+                      " after the projection");
 }
 
 /// The measures of S_M that the report promises.
@@ -6215,8 +6230,9 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
     throw MethodError("insertSurface (§3.6): a node of S_M is " + number(report.maxNodeDistance) +
                       " away from S");
   report.triangles = static_cast<int>(faces.size());
-  report.hausdorff =
-      hausdorffDistance(TriangleTree(M.x, faces), S.tree, samples, perLc * report.lc);
+  const Width farthest =
+      farthestPoint(TriangleTree(M.x, faces), S.tree, samples, perLc * report.lc);
+  report.hausdorff = farthest.distance, report.hausdorffPlace = farthest.place;
 }
 
 /// [choice] Of l_c: a Hausdorff distance S_M - S that is warned of; and what such a way's lowest q
@@ -6225,16 +6241,16 @@ constexpr double poorHausdorff = .3, poorWorth = .6;
 
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
-  constexpr double badHausdorff = .5;  // [choice] of l_c: refused
-  constexpr double poorShift = 2;      // [choice] of h: warned of
+  constexpr double badHausdorff = 1;  // [choice] of l_c, the longest edge of a cube: refused
+  constexpr double poorShift = 2;     // [choice] of h: warned of
+  const std::string found = "the Hausdorff distance S_M - S is " + number(report.hausdorff) +
+                            " near " + placeText(report.hausdorffPlace);
   if (report.hausdorff > badHausdorff * report.lc)
-    throw MethodError("insertSurface (§3.6): the Hausdorff distance S_M - S is " +
-                      number(report.hausdorff) +
-                      ", above half of l_c: S has a part narrower than "
-                      "the cubes");
+    throw MethodError("insertSurface (§3.6): " + found +
+                      ", above l_c: S has a part narrower than the cubes");
   if (report.hausdorff > poorHausdorff * report.lc)
-    report.warnings.push_back("the Hausdorff distance S_M - S, " + number(report.hausdorff) +
-                              ", is above .3 l_c; lower l_c");
+    report.warnings.push_back(found + ", above .3 l_c: S bends or narrows there within the cubes" +
+                              "; lower l_c");
   if (report.tangentialShift > poorShift * h)
     report.warnings.push_back("the projection moved a node " + number(report.tangentialShift) +
                               " along S, more than 2 cube edges; lower l_c");
@@ -6304,9 +6320,13 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   };
   std::vector<Outline> outlines{I.options.outline};
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
+  // [choice] nor, there, whole squares where S_M of half squares is far from S: theirs is as far
+  auto isPoor = [&] {
+    return tets >= large && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
+  };
   std::vector<Selection> tried;
   for (Outline outline : outlines)
-    if (!isGood())
+    if (!isGood() && (outline == outlines[0] || !isPoor()))
       for (const Way& way : extractWays(I, outline)) {
         const Selection& selected = way.extraction.selected;
         if (isGood() || std::find(tried.begin(), tried.end(), selected) != tried.end()) continue;
@@ -6322,7 +6342,6 @@ std::vector<double> sizesToTry(const Mesh& M, const SurfaceDistance& S,
                                const InsertOptions& options, const SizeChoice& chosen) {
   constexpr int maxHalvings = 4;  // of l_c as given, while another surface is in the way
   constexpr int maxLevels = 19;   // checkSize() refuses more
-  constexpr double aboveDiagonal = 1 + 1e-9;  // eq. (1) refines where r^E >= l_c
   std::vector<double> sizes;
   if (options.lc > 0)
     for (int halving = 0; halving <= maxHalvings; ++halving)
@@ -6381,7 +6400,7 @@ std::string advice(const Insertion& I, const Mesh& M, double largest, double lc)
   if (!crossings.empty()) return describe(crossings) + ": mend S there";
   const SizeChoice size = chooseSize(M, S);
   if (size.resolving < lc) return describe(size) + ": lower l_c to " + number(size.resolving);
-  return "lower l_c";
+  return "lower l_c to " + number(.5 * lc);
 }
 
 /// The search for l_c: the first of the sizes with a valid mesh, within the tolerance where one is
@@ -6392,8 +6411,11 @@ void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, M
   const double E = I.options.tolerance;
   const InsertReport start = report;
   double last = sizes[0], nearest = beyondAll;
+  // [choice] no l_c resolves a crossing: one that is small enough to vanish does so at the first
+  const bool crosses = !selfCrossings(I.S.S).empty();
+  const int most = crosses ? 1 : I.options.lc > 0 ? maxTries : static_cast<int>(sizes.size());
   int tries = 0;
-  for (std::size_t i = 0; i < sizes.size() && (I.options.lc == 0 || tries < maxTries); ++i) {
+  for (std::size_t i = 0; i < sizes.size() && tries < most; ++i) {
     const int waysBefore = I.ways;
     I.isBlocked = false;
     try {

@@ -279,6 +279,7 @@ struct InsertReport {
   int nodes = 0, triangles = 0;  // of S_M
   double maxNodeDistance = 0;    // largest |x_i - S| of the nodes of S_M
   double hausdorff = 0;          // two-sided, S_M - S, sampled
+  Vec3 hausdorffPlace;           // where it is
   // largest distance of a projected node from the point of S nearest to it before
   double tangentialShift = 0;
   // against the computational elements; refined: after 3.5
@@ -671,8 +672,10 @@ Width facingSheets(const SurfaceDistance& S, double reach);
 /// the distance to points at least three times as far along the rim, and at least `apart`.
 Width rimWidth(const SurfaceDistance& S, double apart);
 
-/// Two-sided Hausdorff distance, sampled: each triangle at a lattice of samplesPerEdge >= 1 steps,
-/// more where these would be longer than `spacing`.
+/// Two-sided Hausdorff distance and its place, sampled: each triangle at a lattice of
+/// samplesPerEdge >= 1 steps, more where these would be longer than `spacing`.
+Width farthestPoint(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
+                    double spacing = 1e300);
 double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
                          double spacing = 1e300);
 

@@ -257,7 +257,10 @@ bool run(Row row, const Arguments& a) {
       for (const std::string& w : r.warnings)
         std::cout << "  " << M.surfaces[r.surface - 1].name << ": " << w << "\n";
     }
-    if (!a.write.empty()) writeFiles({{a.write + row.name + ".vtk", vtkText(M)}});
+    if (!a.write.empty()) {
+      std::replace(row.name.begin(), row.name.end(), '/', '_');
+      writeFiles({{a.write + row.name + ".vtk", vtkText(M)}});
+    }
   } catch (const Error& error) {
     text = std::string("refused: ") + error.what();
     if (row.refused.empty() && row.valid) fault = "was to be inserted";

@@ -349,6 +349,10 @@ TEST_SUITE("3.2") {
     CHECK(hausdorffDistance(small, small, 4) == 0);
     CHECK(hausdorffDistance(small, large, 4) == doctest::Approx(std::sqrt(4 + .25)));
     CHECK(hausdorffDistance(large, small, 4) == hausdorffDistance(small, large, 4));
+    const Width place = farthestPoint(small, large, 4);
+    CHECK(place.distance == hausdorffDistance(small, large, 4));
+    CHECK(std::min(std::abs(small.closest(place.place).distance - place.distance),
+                   std::abs(large.closest(place.place).distance - place.distance)) < 1e-12);
     CHECK_THROWS_AS(hausdorffDistance(small, large, 0), InputError);
     CHECK_THROWS_AS(hausdorffDistance(small, large, 4, 0), InputError);
     // a large triangle over a small bump: found where the lattice is finer than it
@@ -374,6 +378,23 @@ TEST_SUITE("3.1") {
       CHECK(c.triangle < c.other);
       CHECK(std::abs(c.point.x) <= .02);
       CHECK(c.point.z == doctest::Approx(1).epsilon(.02));
+    }
+    // at one l_c, with the place; the mesh stays as it was
+    TriangleSurface loop = alpha;
+    for (Vec3& p : loop.points) p = {.5 + .1 * p.x, .35 + .15 * p.y, .2 + .25 * p.z};
+    const Mesh before = boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2});
+    Mesh M = before;
+    InsertOptions options;
+    options.lc = .1;
+    try {
+      insertSurface(M, loop, options);
+      FAIL("a surface through itself was inserted");
+    } catch (const MethodError& error) {
+      const std::string text = error.what();
+      CHECK(text.find("crosses or touches itself") != std::string::npos);
+      CHECK(text.find("mend S there") != std::string::npos);
+      CHECK(text.find("nor down to") == std::string::npos);
+      CHECK(shapes::sameMesh(M, before));
     }
     // two triangles with a common point, one edge through the other
     CHECK(selfCrossings({{{0, 0, 0}, {2, 0, 0}, {0, 2, 0}, {1, .5, -1}, {.5, 1, 1}}, {{0, 1, 2}, {0, 3, 4}}}).size() == 1);

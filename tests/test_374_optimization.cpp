@@ -212,6 +212,20 @@ TEST_SUITE("3.7.4") {
     }
   }
 
+  TEST_CASE("Algorithm 2: without the descent a hopeless mesh is given up after ten sweeps, others are not") {
+    OptimizeOptions options;
+    options.globalDescent = false;
+    Mesh M = turnedCube(8, 3, 5, 3, options.fixed);
+    const OptimizeReport report = optimizeMesh(M, options);
+    CHECK(report.sweeps == 10);
+    CHECK(report.inverted > 60);
+    CHECK_FALSE(report.converged);
+    M = shakenCube(6, .6);
+    options.fixed.clear();
+    REQUIRE(qualityStatistics(M).inverted > 60);
+    CHECK(optimizeMesh(M, options).inverted == 0);
+  }
+
   TEST_CASE("Algorithm 2: f never grows in a visit, and a valid star stays valid") {
     // Only node 6 of the star is free: each sweep is one visit of it.
     Mesh M = shapes::unsymmetricStar();
