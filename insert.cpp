@@ -164,8 +164,9 @@ bool separated(const std::array<Vec2, 3>& t, Vec2 low, double cell) {
     const double least = std::min(x[0], x[1]) - std::max(y[0], y[1]);
     const double most = std::max(x[0], x[1]) - std::min(y[0], y[1]);
     constexpr double rounding = 1e-14, part = 1e-6;  // of the products, of a cell: far above it
-    const double margin = rounding * (std::abs(x[0]) + std::abs(x[1]) + std::abs(y[0]) + std::abs(y[1])) +
-                          part * cell * norm(d) + rounding * std::abs(third);
+    const double margin =
+        rounding * (std::abs(x[0]) + std::abs(x[1]) + std::abs(y[0]) + std::abs(y[1])) +
+        part * cell * norm(d) + rounding * std::abs(third);
     if (most < std::min(third, 0.) - margin || least > std::max(third, 0.) + margin) return true;
   }
   return false;
@@ -243,8 +244,7 @@ bool locateIn(const Parametrization& P, Vec2 u, int first, int last, Location& b
 }
 
 /// As locateIn, among the triangles of a tree of boxes.
-bool locateInBoxes(const Parametrization& P, Vec2 u, int root, Location& best,
-                   double& bestInside) {
+bool locateInBoxes(const Parametrization& P, Vec2 u, int root, Location& best, double& bestInside) {
   constexpr double part = 1e-9;  // of the box: as the tolerance of triangles
   int waiting[64] = {root};      // the tree is less deep
   for (int count = 1; count > 0;) {
@@ -539,8 +539,8 @@ struct UnitSquare {
   }
 };
 
-/// A straight edge between two nodes of the net on the meccano's boundary. Half-chain 2 c runs along
-/// chain c, half-chain 2 c + 1 against it.
+/// A straight edge between two nodes of the net on the meccano's boundary. Half-chain 2 c runs
+/// along chain c, half-chain 2 c + 1 against it.
 struct Chain {
   LatticePoint end[2];
   int node[2];
@@ -566,7 +566,7 @@ struct MeccanoSurface {
   std::map<std::pair<LatticePoint, LatticePoint>, int> half;  // unit edge -> 4 square + edge
   std::vector<LatticeRectangle> regions, rectangles;
   std::vector<LatticePoint> nodes;
-  std::vector<char> isCorner;            // [nodes], of the polycube; else where a cut ends
+  std::vector<char> isCorner;  // [nodes], of the polycube; else where a cut ends
   std::vector<Chain> chains;
   std::vector<std::vector<int>> around;  // [nodes], half-chains that leave it, counter-clockwise
   int genus = 0;
@@ -697,8 +697,9 @@ void MeccanoSurface::cutRegions() {
   }
   auto onNet = [&](const LatticePoint& p) {
     const std::vector<LatticePoint> ring = spokes(p);
-    return std::any_of(ring.begin(), ring.end(),
-                       [&](const LatticePoint& q) { return net_.count({p, q}) > 0; });
+    return std::any_of(ring.begin(), ring.end(), [&](const LatticePoint& q) {
+      return net_.count({p, q}) > 0;
+    });
   };
   for (const auto& [at, count] : squaresAt) {
     if (count != 3) continue;
@@ -773,7 +774,8 @@ int MeccanoSurface::rectangleLeftOf(int h) const {
   return squares[squareLeftOf(a, q)].rectangle;
 }
 
-/// Around each rectangle: after half-chain h comes the one before its reverse, seen around the node.
+/// Around each rectangle: after half-chain h comes the one before its reverse, seen around the
+/// node.
 void MeccanoSurface::addRims() {
   std::vector<char> seen(2 * chains.size(), 0);
   for (int first = 0; first < static_cast<int>(seen.size()); ++first) {
@@ -802,12 +804,14 @@ MeccanoSurface::MeccanoSurface(const Meccano& C) {
 
 }  // namespace
 
-// ==== Tools for 2: Floater's equations solved by elimination ======================================
+// ==== Tools for 2: Floater's equations solved by elimination
+// ======================================
 
 namespace {
 
 /// Elimination order of the points not fixed: halves along the longest side of their box, then the
-/// points of the lower half that have a neighbour in the upper one (nested dissection, George 1973).
+/// points of the lower half that have a neighbour in the upper one (nested dissection, George
+/// 1973).
 void appendDissection(const std::vector<Vec3>& points, const SparseMatrix& lambda,
                       std::vector<int> part, std::vector<char>& upper, std::vector<int>& order) {
   constexpr std::size_t leaf = 8;  // [choice] points that are not divided further
@@ -844,11 +848,11 @@ void appendDissection(const std::vector<Vec3>& points, const SparseMatrix& lambd
 
 /// The weights left in each row when the earlier ones are eliminated, in elimination order.
 struct Elimination {
-  std::vector<int> point, row;            // point of each row; row of each point, -1 where fixed
-  std::vector<std::vector<int>> later;    // columns after the diagonal, ascending
+  std::vector<int> point, row;          // point of each row; row of each point, -1 where fixed
+  std::vector<std::vector<int>> later;  // columns after the diagonal, ascending
   std::vector<std::vector<double>> weight;
-  std::vector<double> rim;                // weight that leads to fixed points
-  std::vector<Vec2> pull;                 // Σ weight u of these
+  std::vector<double> rim;  // weight that leads to fixed points
+  std::vector<Vec2> pull;   // Σ weight u of these
 };
 
 /// Where the eliminated rows have entries: those of the row itself, and of the rows whose first
@@ -884,9 +888,9 @@ Elimination eliminationPattern(const std::vector<Vec3>& points, const SparseMatr
   return L;
 }
 
-/// u_i = Σ λ_ij u_j at the points not fixed. Rows are eliminated without any subtraction (Grassmann,
-/// Taksar, Heyman 1985): the diagonal is the sum of what is left in the row, so that every weight is
-/// exact to rounding, however far a point is from the rim.
+/// u_i = Σ λ_ij u_j at the points not fixed. Rows are eliminated without any subtraction
+/// (Grassmann, Taksar, Heyman 1985): the diagonal is the sum of what is left in the row, so that
+/// every weight is exact to rounding, however far a point is from the rim.
 void solveConvexCombinations(const std::vector<Vec3>& points, const SparseMatrix& lambda,
                              const std::vector<char>& fixed, std::vector<Vec2>& u) {
   Elimination L = eliminationPattern(points, lambda, fixed);
@@ -932,7 +936,8 @@ void solveConvexCombinations(const std::vector<Vec3>& points, const SparseMatrix
 
 }  // namespace
 
-// ==== 2. Algorithm 1: Π on the boundary ===========================================================
+// ==== 2. Algorithm 1: Π on the boundary
+// ===========================================================
 
 namespace {
 
@@ -946,7 +951,7 @@ struct CutSolid {
   std::vector<int> triangleOf;                 // [points], a triangle at it
   std::vector<char> onPath;                    // [points], on a chain or at a node
   std::vector<int> node;                       // [nodes], point of each
-  std::vector<std::vector<int>> path;          // [chains], points from end 0 to end 1; empty: none yet
+  std::vector<std::vector<int>> path;  // [chains], points from end 0 to end 1; empty: none yet
 
   explicit CutSolid(const TriangleSurface& D)
       : points(D.points),
@@ -1102,13 +1107,14 @@ std::vector<int> shortestPath(const CutSolid& D, int A, int Z, const std::vector
 /// The shortest path for chain c in the order around its nodes. False: there is none.
 bool tracePath(const MeccanoSurface& B, CutSolid& D, int c, const std::vector<char>& usable = {}) {
   const int A = D.node[B.chains[c].node[0]], Z = D.node[B.chains[c].node[1]];
-  D.path[c] = shortestPath(D, A, Z, allowedSector(B, D, 2 * c), allowedSector(B, D, 2 * c + 1),
-                           usable);
+  D.path[c] =
+      shortestPath(D, A, Z, allowedSector(B, D, 2 * c), allowedSector(B, D, 2 * c + 1), usable);
   D.markPath(c, true);
   return !D.path[c].empty();
 }
 
-/// Traces these chains, none of which has a path; one that is blocked goes first and all start again.
+/// Traces these chains, none of which has a path; one that is blocked goes first and all start
+/// again.
 void tracePaths(const MeccanoSurface& B, CutSolid& D, std::vector<int> order) {
   const std::size_t maxStarts = 4 * order.size() + 4;  // each chain a few times first
   for (std::size_t start = 0; start < maxStarts; ++start) {
@@ -1154,7 +1160,8 @@ void openAtChains(const CutSolid& D, const std::vector<int>& localOf, Disk& P) {
       const int n = D.triangles[P.triangle[l]][i], number = static_cast<int>(P.vertex.size());
       P.vertex.push_back(n);
       P.points.push_back(D.points[n]);
-      for (int direction : {2, 0}) {  // counter-clockwise across edge i + 2, clockwise across edge i
+      for (int direction :
+           {2, 0}) {  // counter-clockwise across edge i + 2, clockwise across edge i
         for (int t = P.triangle[l];;) {
           const int k = cornerAt(D.triangles[t], n), e = (k + direction) % 3;
           P.triangles[localOf[t]][k] = number;
@@ -1192,8 +1199,7 @@ void walkRim(const CutSolid& D, Disk& P) {
                     static_cast<int>(3 * P.triangles.size() + edges) / 2 +
                     static_cast<int>(P.triangles.size());
   if (first < 0 || P.rim.size() != edges || euler != 1)
-    throw MethodError("getBoundaryMapping (§2): a patch of the solid at " +
-                      placeText(P.points[0]) +
+    throw MethodError("getBoundaryMapping (§2): a patch of the solid at " + placeText(P.points[0]) +
                       " is no disk; place the corners in the order of the polycube's, or add "
                       "cubes");
   for (std::size_t k = P.rim.size(); k-- > 0;) {  // lengths to parts
@@ -1573,8 +1579,9 @@ void placeCorners(const MeccanoSurface& B, const Meccano& C, CutSolid& D) {
     const std::string what = "corner " + latticeText(at);
     if (!isFinite(x)) refuseMeccano(what + " has a place that is not finite");
     if (nodeAt.count(at) == 0)
-      refuseMeccano(what + " is no corner of the polycube: three or more of its edges must meet "
-                           "there; remove it or correct its numbers");
+      refuseMeccano(what +
+                    " is no corner of the polycube: three or more of its edges must meet "
+                    "there; remove it or correct its numbers");
     int best = 0;
     for (int n = 0; n < static_cast<int>(D.points.size()); ++n)
       if (norm2(D.points[n] - x) < norm2(D.points[best] - x)) best = n;
@@ -1672,9 +1679,8 @@ void addPatches(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi)
   std::vector<int> pointOf(D.points.size()), patchOf(D.points.size(), -1);
   std::vector<int> byRegion(B.rectangles.size());
   std::iota(byRegion.begin(), byRegion.end(), 0);
-  std::stable_sort(byRegion.begin(), byRegion.end(), [&](int a, int b) {
-    return B.rectangles[a].region < B.rectangles[b].region;
-  });
+  std::stable_sort(byRegion.begin(), byRegion.end(),
+                   [&](int a, int b) { return B.rectangles[a].region < B.rectangles[b].region; });
   for (int r : byRegion) {
     const LatticeRectangle& R = B.rectangles[r];
     Parametrization& P = Pi.patches[R.region];
@@ -1738,8 +1744,7 @@ void addCurves(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) 
       std::vector<double> s{0};
       for (std::size_t k = 1; k < path.size(); ++k)
         s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
-      for (std::size_t k = 0; k + 1 < path.size(); ++k)
-        add(path[k], g, s[k] / s.back());
+      for (std::size_t k = 0; k + 1 < path.size(); ++k) add(path[k], g, s[k] / s.back());
     }
     add(D.node[B.startNode(last ^ 1)], last ^ 1, 0);
     Pi.curves.push_back(C);
@@ -1769,8 +1774,8 @@ struct Attempt {
 void refineUpTo(Mesh& M, double eps, std::size_t mostTets);
 
 /// Mean q after the first placement of the interior, on the meccano's mesh refined to a coarse ε.
-/// [choice] An inverted element counts 0. Where Π squashes a part, the refinement that it needs runs
-/// up to the limit and its elements are flat: a mesh refined evenly does not see it.
+/// [choice] An inverted element counts 0. Where Π squashes a part, the refinement that it needs
+/// runs up to the limit and its elements are flat: a mesh refined evenly does not see it.
 double meanQuality(const Meccano& C, const BoundaryMapping& Pi, std::string& text) {
   constexpr double partOfDiagonal = .01;
   constexpr std::size_t mostTets = 15000;  // [choice] three times what a map that fits needs
@@ -1807,8 +1812,8 @@ double keepBetter(const MeccanoSurface& B, const Meccano& C, CutSolid D, const s
 /// any mapping from which no further start is tried.
 constexpr double goodFit = .8;
 
-/// From corners that are placed: the shortest paths, and where the meccano does not fit so, with the
-/// corners relaxed.
+/// From corners that are placed: the shortest paths, and where the meccano does not fit so, with
+/// the corners relaxed.
 void tryStart(const MeccanoSurface& B, const Meccano& C, CutSolid D, const std::string& way,
               Attempt& best) {
   placeCutEnds(B, D);
@@ -1863,9 +1868,10 @@ BoundaryMapping getBoundaryMapping(const Meccano& C, const TriangleSurface& D) {
     refuseMeccano("the solid has " + counted(genus, "handle") + " and the polycube " +
                   std::to_string(B.genus) + "; give a polycube of the same genus");
   if (genus > 0 && C.corners.empty())
-    refuseMeccano("the solid has " + counted(genus, "handle") +
-                  ", which needs the places of the polycube's corners; add a line `corner i j k x y "
-                  "z` for each");
+    refuseMeccano(
+        "the solid has " + counted(genus, "handle") +
+        ", which needs the places of the polycube's corners; add a line `corner i j k x y "
+        "z` for each");
   CutSolid uncut(D);
   uncut.node.assign(B.nodes.size(), -1);
   uncut.path.resize(B.chains.size());
@@ -1931,7 +1937,8 @@ Mesh getInitialMesh(const Meccano& C, const BoundaryMapping& Pi) {
   M.corners = Pi.corners;
   M.cube = C.cube;
   Vec3 centre;
-  for (const Corner& corner : Pi.corners) centre += (1. / static_cast<double>(Pi.corners.size())) * corner.x;
+  for (const Corner& corner : Pi.corners)
+    centre += (1. / static_cast<double>(Pi.corners.size())) * corner.x;
   for (const LatticePoint& p : nodes) {
     nodeAt[p] = static_cast<int>(M.x.size());
     const bool inside = cubesAt[p] == 8;
@@ -3458,7 +3465,8 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
   if (sizes.size() > 1)
     refuseSurface("the surface has " + std::to_string(sizes.size()) +
                   " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
-                  std::to_string(sizes.back()) + " triangles); insert them one by one, or by insertSurfaces");
+                  std::to_string(sizes.back()) +
+                  " triangles); insert them one by one, or by insertSurfaces");
   const int turned = orientConsistently(C.S, neighbours);
   if (turned < 0) refuseSurface("the surface is not orientable (a Moebius band); cut it open");
   if (turned > 0)
@@ -6525,6 +6533,29 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
   }
 }
 
+/// [choice] Where S_M ends farther than .3 of the given l_c from S, half of it is tried too, and
+/// kept where it brings S_M nearer than that.
+void halveWhereFar(Insertion& I, const Mesh& M, Mesh& result, InsertReport& report) {
+  const double allowed = poorHausdorff * I.options.lc;
+  if (report.lc != I.options.lc || report.hausdorff <= allowed) return;
+  if (I.options.outline == Outline::paper || !selfCrossings(I.S.S).empty()) return;
+  I.leave("l_c = " + number(report.lc),
+          MethodError("the Hausdorff distance S_M - S is " + number(report.hausdorff)));
+  Mesh finer;
+  InsertReport ofFiner;
+  ofFiner.original = report.original;
+  try {
+    checkSize(M, I.S, .5 * report.lc, I.options.maxTets);
+    insertWithSize(I, M, .5 * report.lc, finer, ofFiner);
+  } catch (const MethodError&) {
+    return;
+  } catch (const InputError&) {
+    return;
+  }
+  if (ofFiner.surface > 0 && ofFiner.hausdorff <= allowed)
+    report = ofFiner, result = std::move(finer);
+}
+
 /// 3.2 to 3.7 for one surface, at the sizes that are to be tried.
 InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
   const SurfaceDistance& cleaned = candidate.S;
@@ -6541,6 +6572,7 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
   checkDistances(M, cleaned, sizes[0]);
   Mesh result;
   searchSize(I, M, sizes, result, report);
+  halveWhereFar(I, M, result, report);
   report.size = chosen;
   std::vector<std::string> warnings = candidate.warnings;
   if (options.tolerance == 0 && report.lc < sizes[0])
