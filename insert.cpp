@@ -4116,10 +4116,12 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
   const Width rim = rimWidth(S, rimApart * largest / root3);
   limit("the width between parts of the rim of S", rim.distance, perRim, rim.place);
   size.lc = std::max(size.lc, size.finest);
-  // l_c just below the diagonal of a cube has four times as many tetrahedra: the diagonal instead
+  // [choice] of a surface that crosses itself no more than these: l_c just below the diagonal of a
+  // cube has four times as many, and the diagonal has to do
   const int level = cubeLevel(M, size.lc);
   const double diagonal = norm(M.cube) * std::exp2(-level / 3);
-  if (predictedTets(areaOf(S.S), diagonal / root3) > mostTets && 2 * diagonal < largest)
+  if (predictedTets(areaOf(S.S), diagonal / root3) > mostTets && 2 * diagonal < largest &&
+      !selfCrossings(S.S).empty())
     size.lc = size.finest = 2 * diagonal * aboveDiagonal;
 
   const Gap boundary = smallestGap(S.tree, M.x, patchFaces(M));

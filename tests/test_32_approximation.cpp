@@ -422,22 +422,6 @@ TEST_SUITE("3.2") {
     CHECK(rimWidth(SurfaceDistance(samples::raggedRim()), .2).distance > .1);  // noise is no width
   }
 
-  TEST_CASE("chooseSize: sheets much folded ask for a million tetrahedra at most, at the cubes that l_c gives") {
-    const TriangleSurface folded = samples::sheet(120, 2, [](double s, double t) {
-      return Vec3{.2 + .01 * std::abs(s), .2 + .6 * t, .2 + .6 * std::abs(std::fmod(s + 100, 2) - 1)};
-    });
-    double area = 0;
-    for (const auto& t : folded.triangles)
-      area += .5 * norm(cross(folded.points[t[1]] - folded.points[t[0]], folded.points[t[2]] - folded.points[t[0]]));
-    for (int cells : {1, 2, 3, 4, 5, 6, 7}) {
-      CAPTURE(cells);
-      const Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {cells, cells, cells});
-      const double lc = chooseSize(M, SurfaceDistance(folded)).lc;
-      const double h = std::exp2(-cubeLevel(M, lc) / 3) / cells;
-      CHECK((45 * area / (h * h) <= 1e6 || 2 * std::sqrt(3.) * h > std::sqrt(.36 * 2) / 20));
-    }
-  }
-
   TEST_CASE("chooseSize: features too fine are not followed below 1/8, and the l_c that resolves them is told") {
     const SizeChoice strip = sizeOf(flatStrip(.002)), sheets = sizeOf(gutter(.002));
     CHECK(strip.lc == doctest::Approx(strip.finest));
