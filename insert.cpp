@@ -2908,6 +2908,19 @@ void refineUpTo(Mesh& M, double eps, std::size_t mostTets) {
 
 namespace {
 
+/// Nodes on the boundary.
+std::vector<int> boundaryNodes(const Mesh& M) {
+  std::vector<char> on(M.x.size(), 0);
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (M.faceLabel[E][i] < 0)
+        for (int j = 1; j < 4; ++j) on[M.tets[E][(i + j) % 4]] = 1;
+  std::vector<int> nodes;
+  for (int n = 0; n < static_cast<int>(on.size()); ++n)
+    if (on[n]) nodes.push_back(n);
+  return nodes;
+}
+
 /// [departure] A tetrahedron with two faces on ∂M flattens where Π makes its patch edge smooth, and
 /// no position of its nodes helps. Its edge across is split, where the faces meet at a larger angle
 /// than this.
@@ -2951,24 +2964,6 @@ struct Mesher {
 };
 
 constexpr double sampledEps = .97;  // [choice] of ε is held where it is sampled: 3 % for between
-
-/// The boundary nodes that stay while the mesh is tangled. [choice] Those of planar patches alone
-/// slide: ∂M meets these exactly wherever they are, and where the ground rises beside the upright
-/// side of a terrain, a node of the side may start below it.
-std::vector<int> keptNodes(const Mesher& W) {
-  const Mesh& M = W.M;
-  std::vector<char> on(M.x.size(), 0);
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
-    for (int i = 0; i < 4; ++i) {
-      const int label = M.faceLabel[E][i];
-      if (label < 0 && (W.options.fixedBoundary || W.Omega.curved[-label - 1]))
-        for (int j = 1; j < 4; ++j) on[M.tets[E][(i + j) % 4]] = 1;
-    }
-  std::vector<int> nodes;
-  for (int n = 0; n < static_cast<int>(on.size()); ++n)
-    if (on[n]) nodes.push_back(n);
-  return nodes;
-}
 
 std::string sizeText(const Mesh& M) { return std::to_string(M.tets.size()) + " tetrahedra"; }
 
@@ -3015,7 +3010,6 @@ int refineToDistance(Mesher& W, double eps) {
 /// them for more freedom. Returns the number of inverted elements left.
 int untangleFixed(Mesher& W, bool smooth) {
   constexpr int maxRounds = 10, patience = 2;  // rounds without fewer inverted elements
-  constexpr int few = 150;                     // more are no local fault: bisecting adds to them
   OptimizeOptions optimize = W.options.optimize;
   optimize.starDelta = true;
   optimize.globalDescent = false;
@@ -3026,12 +3020,11 @@ int untangleFixed(Mesher& W, bool smooth) {
     if (splitFlatCorners(B) == 0) break;
   }
   for (int round = 0;; ++round) {
-    optimize.fixed = keptNodes(W);
+    optimize.fixed = boundaryNodes(W.M);
     const int inverted = optimizeMesh(W.M, optimize).inverted;
     W.progress("fixed boundary: " + sizeText(W.M) + ", " + std::to_string(inverted) + " inverted");
     if (inverted >= fewest) ++waited;
-    if (inverted == 0 || inverted > few || waited == patience || round == maxRounds)
-      return inverted;
+    if (inverted == 0 || waited == patience || round == maxRounds) return inverted;
     fewest = std::min(fewest, inverted);
     Bisection B(W.M);
     const std::vector<double> q = qualities(W.M);
@@ -3087,37 +3080,11 @@ OptimizeReport slideWithin(Mesher& W, double allowed, bool last) {
 /// far, and what they leave is refined; in the end hardly any face exceeds ε.
 constexpr double guard[] = {3, 1.5, .8, .8, .8, .8};
 
-/// [choice] Of ε, one after the other where a mesh refined to ε at once stays tangled.
-constexpr double approach[] = {32, 16, 8, 4, 2, 1};
-
-/// From the initial mesh to ε in steps, each of them untangled from the valid mesh before it: new
-/// nodes start in the middle of their edges, so few elements turn over at a time. Returns the number
-/// of inverted elements left.
-int approachGradually(Mesher& W) {
-  int left = 0;
-  placeInterior(W.M);
-  for (double factor : approach) {
-    const double eps = factor * sampledEps * W.options.eps;
-    refineToDistance(W, eps);
-    left = untangleFixed(W, W.options.fixedBoundary && factor == 1);
-    if (left == 0 && !W.options.fixedBoundary && factor > 1)
-      slideWithin(W, eps, false);
-    else if (left > 0)
-      placeInterior(W.M);
-  }
-  return left;
-}
-
-/// qualityOptimization with ∂Ω prepared; `initial` is the mesh before its refinement.
-void optimizeQuality(Mesher& W, const Mesh& initial) {
+/// qualityOptimization with ∂Ω prepared.
+void optimizeQuality(Mesher& W) {
   const double eps = sampledEps * W.options.eps;
   placeInterior(W.M);
-  int left = untangleFixed(W, W.options.fixedBoundary);
-  if (left > 0) {
-    W.M = initial;
-    left = approachGradually(W);
-  }
-  if (left > 0)
+  if (const int left = untangleFixed(W, W.options.fixedBoundary); left > 0)
     throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
                       " elements stay inverted with the boundary fixed; lower eps, or give a "
                       "polycube that fits the solid better");
@@ -3167,7 +3134,7 @@ void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& re
   checkOptions(options.optimize, M.x.size());
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
-  optimizeQuality(W, M);
+  optimizeQuality(W);
   M = std::move(work);
 }
 
@@ -3187,7 +3154,7 @@ MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
   W.stage("refined");
   W.progress("refined: " + sizeText(work) + " after " + std::to_string(report.passes) +
              " passes, " + std::to_string(report.refined.inverted) + " inverted");
-  optimizeQuality(W, M);
+  optimizeQuality(W);
   report.distance = distanceTo(work, W.Omega, 0);
   report.smoothed = qualityStatistics(work);
   report.regular = qualityStatistics(work, Ideal::regular);

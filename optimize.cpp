@@ -818,38 +818,10 @@ void buildStars(Smoother& S) {
   S.starStart.push_back(static_cast<int>(S.star.size()));
 }
 
-/// 1 where vertices o see vertex k on the same side as a positive tetrahedron's in ξ, else -1.
-int orientationInXi(const Mesh& M, std::size_t E, const int* o, int k) {
-  const std::array<int, 4>& z = M.tets[E];
-  const Vec3 x = M.xi[z[k]];
-  return dot(M.xi[z[o[0]]] - x, cross(M.xi[z[o[1]]] - x, M.xi[z[o[2]]] - x)) < 0 ? -1 : 1;
-}
-
-/// [boundary patches] 1 or -1: whether most of a patch's area in 𝓤 is counter-clockwise when its
-/// faces are oriented by their elements in ξ. New nodes of a refined boundary may start folded.
-std::vector<int> patchTurns(const Mesh& M) {
-  std::vector<double> area(M.patches.size(), 0);
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
-    for (int k = 0; k < 4; ++k) {
-      const int label = M.faceLabel[E][k];
-      if (label >= 0) continue;
-      Vec2 u[3];
-      bool known = true;
-      for (int i = 0; i < 3; ++i)
-        known = known && parameterOn(M, M.tets[E][opposite[k][i]], label, u[i]);
-      if (known)
-        area[-label - 1] += orientationInXi(M, E, &opposite[k][0], k) * cross(u[1] - u[0], u[2] - u[0]);
-    }
-  std::vector<int> turns;
-  for (double a : area) turns.push_back(a < 0 ? -1 : 1);
-  return turns;
-}
-
 /// The labelled faces at each sliding node, as triangles of 𝓤.
 void buildSheets(Smoother& S) {
   const Mesh& M = S.M;
   if (M.faceLabel.empty() || M.dimension.empty()) return;
-  const std::vector<int> turns = patchTurns(M);
   std::vector<std::pair<int, SheetTriangle>> entries;
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int k = 0; k < 4; ++k) {
@@ -863,9 +835,7 @@ void buildSheets(Smoother& S) {
         known = known && parameterOn(M, v[i], label, u[i]);
       }
       const double area = known ? cross(u[1] - u[0], u[2] - u[0]) : 0;
-      const bool turned =
-          label < 0 ? turns[-label - 1] * orientationInXi(M, E, &opposite[k][0], k) < 0 : area < 0;
-      if (turned) std::swap(v[1], v[2]);
+      if (area < 0) std::swap(v[1], v[2]);
       for (int i = 0; i < 3 && area != 0; ++i)
         if (S.freedom[v[i]] == 1 || S.freedom[v[i]] == 2)
           entries.push_back({v[i], {v[(i + 1) % 3], v[(i + 2) % 3], label}});
@@ -989,23 +959,18 @@ double visitInner(Smoother& S, int n, const Visit& visit, const Edges& edges) {
 }
 
 /// [departure] Whether the surface triangles at n stay counter-clockwise in 𝓤 with n at this
-/// parameter, those that are not yet (new nodes of a refined boundary) come nearer to it. While
-/// elements are inverted f alone lets a node slide past its neighbours, or a rim node round a
-/// corner, from where no descent brings it back.
+/// parameter. While elements are inverted f alone lets a node slide past its neighbours, or a rim
+/// node round a corner, from where no descent brings it back.
 bool staysUnfolded(Smoother& S, int n, Vec2 parameter) {
   if (S.sheetStart.empty()) return true;
   const Vec2 before = S.M.parameter[n];
-  const auto twiceArea = [&](const SheetTriangle& t, Vec2 at) {
-    Vec2 u, a, b;
-    S.M.parameter[n] = at;
-    const bool known = parameterOn(S.M, n, t.label, u) && parameterOn(S.M, t.a, t.label, a) &&
-                       parameterOn(S.M, t.b, t.label, b);
-    return known ? cross(a - u, b - u) : -unbounded;
-  };
+  S.M.parameter[n] = parameter;
   bool unfolded = true;
+  Vec2 u, a, b;
   for (int k = S.sheetStart[n]; k < S.sheetStart[n + 1] && unfolded; ++k) {
-    const double area = twiceArea(S.sheet[k], parameter);
-    unfolded = area > 0 || area > twiceArea(S.sheet[k], before);
+    const SheetTriangle& t = S.sheet[k];
+    unfolded = parameterOn(S.M, n, t.label, u) && parameterOn(S.M, t.a, t.label, a) &&
+               parameterOn(S.M, t.b, t.label, b) && cross(a - u, b - u) > 0;
   }
   S.M.parameter[n] = before;
   return unfolded;
@@ -1548,8 +1513,6 @@ bool untangleAndSmooth(Smoother& S) {
     }
     S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted)) : 0;
     S.tangled = tangled;
-    if (tangled && S.rung != schedule.rung)  // another δ: nodes at rest may move
-      for (int n : S.order) wakeNode(S, n);
     S.rung = schedule.rung;
     const bool accelerated = !tangled && S.options.acceleration > 0;
     if (accelerated) acceleration.beforeSweep();
