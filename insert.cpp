@@ -2311,17 +2311,19 @@ int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
     if (parameterOn(M, a, e.entity, u0) && parameterOn(M, b, e.entity, u1)) {
       dimension = 2, entity = e.entity, parameter = .5 * (u0 + u1);
       const Vec3 onS = varphi(surfaceOf(M, entity), parameter);
-      if (!isBridging(M.x[a], M.x[b], onS))
-        x = onS;
-      else
+      const bool inserted = entity > 0;  // a patch of ∂𝓜 has no slits, and Π may squash it
+      if (inserted && isBridging(M.x[a], M.x[b], onS))
         x = nearestOn(surfaceOf(M, entity), x, parameter);
+      else
+        x = onS;
     }
   } else if (e.dimension == 1 && e.entity > 0) {
     double s0 = 0, s1 = 0;
     if (parameterOnCurve(M, a, e.entity, s0) && parameterOnCurve(M, b, e.entity, s1)) {
       const Curve& C = M.curves[e.entity - 1];
       dimension = 1, entity = e.entity, parameter = {curveMidpoint(C, s0, s1), 0};
-      if (isBridging(M.x[a], M.x[b], gamma(C, parameter.x)))
+      const bool rim = !C.sides.empty() && C.sides[0].surface > 0;
+      if (rim && isBridging(M.x[a], M.x[b], gamma(C, parameter.x)))
         parameter.x = besideBridge(C, s0, s1, norm(M.x[b] - M.x[a]), x);
       x = gamma(C, parameter.x);
     }
