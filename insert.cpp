@@ -6516,29 +6516,6 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
   }
 }
 
-/// [choice] Where S_M ends farther than .3 of the given l_c from S, half of it is tried too, and
-/// kept where it brings S_M nearer than that.
-void halveWhereFar(Insertion& I, const Mesh& M, Mesh& result, InsertReport& report) {
-  const double allowed = poorHausdorff * I.options.lc;
-  if (report.lc != I.options.lc || report.hausdorff <= allowed) return;
-  if (I.options.outline == Outline::paper || !selfCrossings(I.S.S).empty()) return;
-  I.leave("l_c = " + number(report.lc),
-          MethodError("the Hausdorff distance S_M - S is " + number(report.hausdorff)));
-  Mesh finer;
-  InsertReport ofFiner;
-  ofFiner.original = report.original;
-  try {
-    checkSize(M, I.S, .5 * report.lc, I.options.maxTets);
-    insertWithSize(I, M, .5 * report.lc, finer, ofFiner);
-  } catch (const MethodError&) {
-    return;
-  } catch (const InputError&) {
-    return;
-  }
-  if (ofFiner.surface > 0 && ofFiner.hausdorff <= allowed)
-    report = ofFiner, result = std::move(finer);
-}
-
 /// 3.2 to 3.7 for one surface, at the sizes that are to be tried.
 InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
   const SurfaceDistance& cleaned = candidate.S;
@@ -6555,7 +6532,6 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
   checkDistances(M, cleaned, sizes[0]);
   Mesh result;
   searchSize(I, M, sizes, result, report);
-  halveWhereFar(I, M, result, report);
   report.size = chosen;
   std::vector<std::string> warnings = candidate.warnings;
   if (options.tolerance == 0 && report.lc < sizes[0])
