@@ -6232,13 +6232,13 @@ constexpr double poorHausdorff = .3, poorWorth = .6;
 
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
-  constexpr double badHausdorff = 1;  // [choice] of l_c, the longest edge of a cube: refused
-  constexpr double poorShift = 2;     // [choice] of h: warned of
+  constexpr double badHausdorff = .5;  // [choice] of l_c: refused
+  constexpr double poorShift = 2;      // [choice] of h: warned of
   const std::string found = "the Hausdorff distance S_M - S is " + number(report.hausdorff) +
                             " near " + placeText(report.hausdorffPlace);
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): " + found +
-                      ", above l_c: S has a part narrower than the cubes");
+                      ", above half of l_c: S has a part narrower than the cubes");
   if (report.hausdorff > poorHausdorff * report.lc)
     report.warnings.push_back(found + ", above .3 l_c: S bends or narrows there within the cubes" +
                               "; lower l_c");
