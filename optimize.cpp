@@ -45,7 +45,10 @@ Mat3 jacobian(const std::array<Vec3, 4>& ideal, const std::array<Vec3, 4>& physi
   return P * inverse(I);  // eq. (6): the affine map takes each edge of E^I to its edge of E^P
 }
 
-double quality(const Mat3& J) { return det(J) > 0 ? 1 / eta(J) : 0; }  // eq. (7)
+double quality(const Mat3& J) {
+  const double q = det(J) > 0 ? 1 / eta(J) : 0;  // eq. (7)
+  return q > 0 ? q : 0;                          // no number where det(J) overflows
+}
 
 double h(double sigma, double delta) {
   const double R = std::sqrt(sigma * sigma + 4 * delta * delta);
