@@ -5842,7 +5842,8 @@ std::vector<char> holdBridges(const ApproximatingSurface& SM, const std::vector<
 }
 
 /// [§3.6 departure] ϕ_M⁻¹ anchored at ϕ⁻¹ of the nearest points of S; where triangles fold the
-/// anchors go, in growing rings, until none folds.
+/// anchors go, in growing rings, until none folds. Where some always do, as beside a bridge, the
+/// map with the fewest: without anchors the limbs of S_M move along S by many h.
 ///   u  set at the rim
 std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDistance& S,
                               const Parametrization& Phi, std::vector<Vec2> u) {
@@ -5859,15 +5860,18 @@ std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDista
   const std::vector<Vec2> anchor = u;
   const std::vector<char> bridges = bridgingTriangles(SM, Phi, anchor);
   const std::vector<char> held = holdBridges(SM, bridges, mu);
+  std::vector<Vec2> best;
+  std::size_t fewest = SM.S.triangles.size() + 1;
   for (int rings = 0; rings <= maxRings; rings = 2 * rings + 1) {
     u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor);
     std::vector<int> flipped;
     for (int t : flippedTriangles(SM.S.triangles, u))
       if (!bridges[t]) flipped.push_back(t);
-    if (flipped.empty()) return u;
+    if (flipped.size() < fewest) fewest = flipped.size(), best = u;
+    if (flipped.empty()) break;
     weakenAnchors(SM.S, flipped, rings, held, mu);
   }
-  return floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
+  return best;
 }
 
 /// Places one node on the entity of this dimension.
@@ -6390,8 +6394,7 @@ std::string advice(const Insertion& I, const Mesh& M, double largest, double lc)
   const std::vector<Crossing> crossings = selfCrossings(S.S);
   if (!crossings.empty()) return describe(crossings) + ": mend S there";
   const SizeChoice size = chooseSize(M, S);
-  if (size.resolving < lc) return describe(size) + ": lower l_c to " + number(size.resolving);
-  return "lower l_c to " + number(.5 * lc);
+  return describe(size) + ": lower l_c to " + number(std::min(size.resolving, .5 * lc));
 }
 
 /// The search for l_c: the first of the sizes with a valid mesh, within the tolerance where one is
@@ -6546,6 +6549,17 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
   return report;
 }
 
+/// [choice] `largestFirst`: these leave each other more room than the smaller leave them; of equal
+/// area (to 7 digits) the lowest. The order of the caller's list decides nothing.
+void largestFirst(std::vector<Candidate>& all) {
+  auto key = [](const Candidate& one) {
+    const Vec3 lo = one.S.tree.nodes[0].box.lo;
+    return std::make_tuple(-static_cast<float>(areaOf(one.S.S)), lo.z, lo.y, lo.x);
+  };
+  std::stable_sort(all.begin(), all.end(),
+                   [&](const Candidate& a, const Candidate& b) { return key(a) < key(b); });
+}
+
 /// What an insertion asks of the mesh and the options before it looks at a surface.
 void checkStart(const Mesh& M, const InsertOptions& options) {
   checkMeccano(M, "insertSurface (§3.1)");
@@ -6568,8 +6582,9 @@ InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOption
 std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
                                          const InsertOptions& options) {
   checkStart(M, options);
-  const std::vector<Candidate> all = candidatesOf(S);
+  std::vector<Candidate> all = candidatesOf(S);
   checkApart(M, all);
+  largestFirst(all);
   Mesh result = M;
   std::vector<InsertReport> reports;
   for (const Candidate& one : all)

@@ -974,9 +974,11 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational)
 ///           what it promises; SolverError: a linear solve failed. M is unchanged when it throws.
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options);
 
-/// [§3, §4.2] Inserts several surfaces, in this order: all or none. A surface of several components
-/// becomes several. Nodes of earlier surfaces slide on theirs while later ones are inserted.
-///   returns a report for each surface; original and smoothed are of the mesh before and after it
+/// [§3, §4.2] Inserts several surfaces: all or none, the largest first, in whichever order they are
+/// given. A surface of several components becomes several. Nodes of earlier surfaces slide on
+/// theirs while later ones are inserted.
+///   returns a report for each surface, in the order of their numbers in M; original and smoothed
+///           are of the mesh before and after it
 ///   errors  as insertSurface, the message begins with the surface's name; InputError: two surfaces
 ///           cross or touch, or one and a surface of M. M is unchanged when it throws.
 std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,

@@ -32,6 +32,13 @@ InsertOptions withSize(double lc) {
   return options;
 }
 
+const TriangleSurface& named(const std::vector<TriangleSurface>& S, const std::string& name) {
+  for (const TriangleSurface& one : S)
+    if (one.name == name) return one;
+  FAIL("no surface " << name);
+  return S[0];
+}
+
 /// Each surface of the call is a disk of the mesh on its own S, by its name.
 void checkSurfaces(const Mesh& M, const std::vector<TriangleSurface>& S,
                    const std::vector<InsertReport>& reports) {
@@ -44,12 +51,12 @@ void checkSurfaces(const Mesh& M, const std::vector<TriangleSurface>& S,
   int shared = 0;
   for (std::size_t i = 0; i < S.size(); ++i) {
     const int k = static_cast<int>(i) + 1;
-    CHECK(M.surfaces[i].name == S[i].name);
+    const TriangleSurface& one = named(S, M.surfaces[i].name);
     CHECK(reports[i].surface == k);
     const std::vector<shapes::Face> faces = surfaceFaces(M, k);
     CHECK(shapes::isDisk(faces));
-    const double distance = shapes::maxDistanceToSurface(M, k, S[i]);
-    CHECK(distance <= 1e-12 * shapes::diagonal(S[i]));
+    const double distance = shapes::maxDistanceToSurface(M, k, one);
+    CHECK(distance <= 1e-12 * shapes::diagonal(one));
     CHECK(reports[i].triangles == static_cast<int>(faces.size()));  // as it is at the end
     CHECK(reports[i].hausdorff <= .3 * reports[i].lc);
     for (const shapes::Face& f : faces)
@@ -89,10 +96,10 @@ TriangleSurface together(const TriangleSurface& A, const TriangleSurface& B) {
 }  // namespace
 
 TEST_SUITE("4.2") {
-  TEST_CASE("sets: three surfaces in one call, in two orders; as if inserted one by one") {
-    std::vector<TriangleSurface> S{sheetAt({.45, .5, .3}, .2, .03, "low"),
-                                   sheetAt({.55, .5, .52}, .2, -.03, "middle"),
-                                   sheetAt({.5, .5, .72}, .15, .02, "high")};
+  TEST_CASE("sets: three surfaces in one call: the largest first, in whichever order they are listed") {
+    std::vector<TriangleSurface> S{sheetAt({.45, .5, .3}, .2, .03, "large"),
+                                   sheetAt({.55, .5, .52}, .18, -.03, "middle"),
+                                   sheetAt({.5, .5, .72}, .15, .02, "small")};
     const InsertOptions options = withSize(.16);
     Mesh M = box();
     const std::vector<InsertReport> reports = insertSurfaces(M, S, options);
@@ -102,7 +109,11 @@ TEST_SUITE("4.2") {
     CHECK(shapes::sameMesh(M, oneByOne));
     std::reverse(S.begin(), S.end());
     Mesh reversed = box();
-    checkSurfaces(reversed, S, insertSurfaces(reversed, S, options));
+    insertSurfaces(reversed, S, options);
+    CHECK(shapes::sameMesh(M, reversed));
+    Mesh smallestFirst = box();
+    for (const TriangleSurface& one : S) insertSurface(smallestFirst, one, options);
+    CHECK(shapes::countInverted(smallestFirst) == 0);
   }
 
   TEST_CASE("sets: surfaces nearer than l_c, down to half a cube") {
