@@ -193,7 +193,7 @@ std::vector<std::vector<int>> cellsOf(const Parametrization& P) {
   return cells;
 }
 
-constexpr int crowded = 16;  // triangles in a box that is halved; a vertex may well have 12
+constexpr int crowded = 6;  // triangles in a box that is halved; a vertex may well have 12
 
 /// Halves a run of P.gridTriangles, across the longer side of its box, down to few in a box.
 /// Returns the number of its box. The recursion is as deep as the logarithm of the run's length.
@@ -225,14 +225,20 @@ int addBoxes(Parametrization& P, int first, int last) {
   return number;
 }
 
+constexpr double farOutside = -1e-8;  // barycentric: well below the tolerance of locate
+
 /// Looks for u among a run of P.gridTriangles. Returns whether it is inside one of them.
 bool locateIn(const Parametrization& P, Vec2 u, int first, int last, Location& best,
               double& bestInside) {
   for (int i = first; i < last; ++i) {
     const std::array<int, 3>& t = P.triangles[P.gridTriangles[i]];
     const Vec2 a = P.u[t[0]] - u, b = P.u[t[1]] - u, c = P.u[t[2]] - u;
-    const double area = cross(b - a, c - a);
-    const double w0 = cross(b, c) / area, w1 = cross(c, a) / area, w2 = 1 - w0 - w1;
+    const double area = cross(b - a, c - a), ofA = cross(b, c), ofB = cross(c, a);
+    // most triangles are left here: clearly outside, without a division
+    const double outside = farOutside * std::abs(area), side = area < 0 ? -1 : 1;
+    if (side * ofA < outside || side * ofB < outside || side * (area - ofA - ofB) < outside)
+      continue;
+    const double w0 = ofA / area, w1 = ofB / area, w2 = 1 - w0 - w1;
     const double inside = std::min({w0, w1, w2});
     if (inside > bestInside) {
       bestInside = inside;
@@ -3030,61 +3036,153 @@ double movedFaceDistance(const Mesh& M, const BoundaryFace& face, double enough)
   return most;
 }
 
-/// Algorithm 2 on all nodes; a boundary node is not moved where a face beside it gets farther than
-/// allowed and worse.
-OptimizeReport slideWithin(Mesher& W, double allowed, bool last) {
-  Mesh& M = W.M;
-  std::vector<std::vector<BoundaryTriangle>> facesAt(M.x.size());
-  for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
-    for (int i = 0; i < 4; ++i)
-      if (M.faceLabel[E][i] < 0 && W.Omega.curved[-M.faceLabel[E][i] - 1])
-        for (int j = 1; j < 4; ++j) facesAt[M.tets[E][(i + j) % 4]].push_back({E, i});
+/// Keeps the curved faces of ∂M near Π while their nodes slide.
+struct SlideGuard {
+  Mesh& M;
+  double allowed;
+  std::vector<BoundaryTriangle> faces;
+  std::vector<double> bound;             // [faces] of the distance, as far as it is known
+  std::vector<std::vector<int>> facesAt;  // [nodes]
+
+  SlideGuard(Mesher& W, double most) : M(W.M), allowed(most), facesAt(W.M.x.size()) {
+    for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
+      for (int i = 0; i < 4; ++i)
+        if (M.faceLabel[E][i] < 0 && W.Omega.curved[-M.faceLabel[E][i] - 1]) {
+          for (int j = 1; j < 4; ++j)
+            facesAt[M.tets[E][(i + j) % 4]].push_back(static_cast<int>(faces.size()));
+          faces.push_back({E, i});
+        }
+    bound.assign(faces.size(), 1e300);
+  }
+  /// Whether node n may move there: no face beside it gets farther than allowed and worse.
+  bool accept(int n, Vec3 x, Vec2 parameter);
+};
+
+bool SlideGuard::accept(int n, Vec3 x, Vec2 parameter) {
+  // [choice] A face's distance grows by this part of a node's step at most; by 2 were Π isometric.
+  constexpr double growth = 3;
+  const double step = growth * norm(x - M.x[n]);
+  std::vector<double> after;
+  for (int f : facesAt[n]) {
+    after.push_back(bound[f] + step);
+    if (after.back() <= allowed) continue;
+    std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
+    after.back() = movedFaceDistance(M, boundaryFace(M, faces[f]), allowed);
+    std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
+    if (after.back() > allowed &&
+        after.back() >= movedFaceDistance(M, boundaryFace(M, faces[f]), allowed))
+      return false;
+  }
+  for (std::size_t k = 0; k < after.size(); ++k) bound[facesAt[n][k]] = after[k];
+  return true;
+}
+
+/// Algorithm 2 on all nodes, first on the active ones (none given: all); a boundary node is not
+/// moved where a face beside it gets farther than allowed and worse. Then, if wanted, the worst
+/// elements are lifted.
+OptimizeReport slideWithin(Mesher& W, double allowed, bool lift, std::vector<int> active = {}) {
+  // [choice] Sweeps: what is left to do after these goes on for hundreds, at the kinks of Π.
+  constexpr int sweepsBetween = 30, sweepsAtLast = 60, sweepsOfLift = 300;
+  SlideGuard guard(W, allowed);
   OptimizeOptions optimize = W.options.optimize;
   optimize.globalDescent = false;
   optimize.starDelta = true;
-  if (!last) optimize.power = 1;
-  optimize.accept = [&](int n, Vec3 x, Vec2 parameter) {
-    bool good = true;
-    for (const BoundaryTriangle& at : facesAt[n]) {
-      std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
-      const double after = movedFaceDistance(M, boundaryFace(M, at), allowed);
-      std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
-      good = after <= allowed || after < movedFaceDistance(M, boundaryFace(M, at), allowed);
-      if (!good) break;
-    }
-    return good;
-  };
-  return optimizeMesh(M, optimize);
+  optimize.power = 1;
+  optimize.maxSweeps = lift ? sweepsAtLast : sweepsBetween;
+  optimize.active = std::move(active);
+  optimize.accept = [&](int n, Vec3 x, Vec2 parameter) { return guard.accept(n, x, parameter); };
+  const OptimizeReport report = optimizeMesh(W.M, optimize);
+  W.progress("  slide: " + counted(report.sweeps, "sweep") + " min " + number(report.minQ) + " mean " + number(report.meanQ));
+  if (!lift || report.inverted > 0) return report;
+  optimize.power = W.options.optimize.power;
+  optimize.maxDisp = 1;  // the sweep before it is no more than a test
+  optimize.maxSweeps = sweepsOfLift;
+  return optimizeMesh(W.M, optimize);
 }
 
-/// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide
-/// far, and what they leave is refined; in the end hardly any face exceeds ε.
-constexpr double guard[] = {3, 1.5, .8, .8, .8, .8};
+/// [departure] Of ε, one after the other where the mesh refined to ε at once is tangled: each
+/// starts from the valid mesh of the one before, whose boundary has slid into place, so that few
+/// elements turn over at a time and long ways are gone on coarse meshes.
+constexpr double approach[] = {16, 8, 4, 2, 1};
 
-/// qualityOptimization with ∂Ω prepared.
-void optimizeQuality(Mesher& W) {
-  const double eps = sampledEps * W.options.eps;
+/// From the initial mesh to ε in these steps. Returns the number of inverted elements left.
+int approachGradually(Mesher& W, const Mesh& initial) {
+  int left = 0;
+  W.M = initial;
+  for (double factor : approach) {
+    const double eps = factor * sampledEps * W.options.eps;
+    refineToDistance(W, eps);
+    const Mesh refined = W.M;
+    left = untangleFixed(W, false);
+    if (left > 0) {
+      W.M = refined;
+      placeInterior(W.M);
+      left = untangleFixed(W, false);
+    }
+    if (left > 0 && factor > 1)
+      W.M = refined;
+    else if (factor > 1 && !W.options.fixedBoundary)
+      slideWithin(W, eps, false);
+  }
+  return left;
+}
+
+/// The first valid mesh within eps. Returns whether its boundary has slid already.
+bool untangleWithin(Mesher& W, const Mesh& initial, double eps) {
   placeInterior(W.M);
-  if (const int left = untangleFixed(W, W.options.fixedBoundary); left > 0)
+  if (qualityStatistics(W.M).inverted > 0 && !W.options.fixedBoundary) {
+    const Mesh refined = W.M;
+    if (approachGradually(W, initial) == 0) return true;
+    W.M = refined;
+  }
+  int left = untangleFixed(W, W.options.fixedBoundary);
+  if (left > 0 && W.options.fixedBoundary) left = approachGradually(W, initial);
+  if (left > 0)
     throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
                       " elements stay inverted with the boundary fixed; lower eps, or give a "
                       "polycube that fits the solid better");
   refineToDistance(W, eps);
+  return false;
+}
+
+/// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide
+/// far, and what they leave is refined; in the end hardly any face exceeds ε.
+constexpr double guards[] = {3, 1.5, .8, .8, .8, .8};
+constexpr int firstOfLast = 2;  // the rounds from here on end with what they reach
+
+/// Nodes of the tetrahedra at nodes from `first` on: where a refinement has been.
+std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
+  std::vector<char> near(M.x.size(), 0);
+  for (const std::array<int, 4>& z : M.tets)
+    if (std::size_t(*std::max_element(z.begin(), z.end())) >= first)
+      for (int n : z) near[n] = 1;
+  std::vector<int> nodes;
+  for (int n = 0; n < static_cast<int>(near.size()); ++n)
+    if (near[n]) nodes.push_back(n);
+  return nodes;
+}
+
+/// qualityOptimization with ∂Ω prepared; `initial` is the mesh before its refinement.
+void optimizeQuality(Mesher& W, const Mesh& initial) {
+  constexpr int fewInverted = 60;
+  const double eps = sampledEps * W.options.eps;
+  const bool slid = untangleWithin(W, initial, eps);
   W.report.untangled = qualityStatistics(W.M);
   W.stage("untangled");
   if (W.options.fixedBoundary) return;
-  constexpr int fewInverted = 60;
   Mesh valid = W.M;
   double best = 0;
-  const int rounds = static_cast<int>(std::size(guard));
-  for (int round = 1; round <= rounds; ++round) {
-    const bool last = guard[round - 1] < 1;
-    const OptimizeReport o = slideWithin(W, guard[round - 1] * eps, last);
+  std::vector<int> active;  // none: all
+  const int rounds = static_cast<int>(std::size(guards));
+  for (int round = slid ? firstOfLast : 0; round < rounds; ++round) {
+    const bool last = round >= firstOfLast;
+    const OptimizeReport o = slideWithin(W, guards[round] * eps, last, active);
     const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
-    W.progress("round " + std::to_string(round) + ": " + sizeText(W.M) + ", min " + number(o.minQ) +
-               ", mean " + number(o.meanQ) + ", distance " + number(d.largest()) + ", " +
-               std::to_string(o.inverted) + " inverted");
+    W.progress("round " + std::to_string(round + 1) + ": " + sizeText(W.M) + ", min " +
+               number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " +
+               number(d.largest()) + ", " + std::to_string(o.inverted) + " inverted");
     const bool within = d.largest() <= eps;
+    const std::size_t nodes = W.M.x.size();
     if (!within) refineToDistance(W, eps);
     if (!within || o.inverted > 0) {
       // a few that stay are left to the next round, whose boundary slides
@@ -3092,8 +3190,9 @@ void optimizeQuality(Mesher& W) {
     }
     const QualityStatistics q = qualityStatistics(W.M);
     if (q.inverted == 0 && q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
-      best = q.min, valid = W.M, W.report.rounds = round;
+      best = q.min, valid = W.M, W.report.rounds = round + 1;
     if (within && last && q.inverted == 0) break;
+    if (last && q.inverted == 0) active = nodesNear(W.M, nodes);
   }
   W.M = std::move(valid);
 }
@@ -3115,7 +3214,7 @@ void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& re
   checkOptions(options.optimize, M.x.size());
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
-  optimizeQuality(W);
+  optimizeQuality(W, M);
   M = std::move(work);
 }
 
@@ -3135,7 +3234,7 @@ MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
   W.stage("refined");
   W.progress("refined: " + sizeText(work) + " after " + std::to_string(report.passes) +
              " passes, " + std::to_string(report.refined.inverted) + " inverted");
-  optimizeQuality(W);
+  optimizeQuality(W, M);
   report.distance = distanceTo(work, W.Omega, 0);
   report.smoothed = qualityStatistics(work);
   report.regular = qualityStatistics(work, Ideal::regular);
