@@ -3006,18 +3006,24 @@ int untangleFixed(Mesher& W, bool smooth) {
     Bisection B(W.M);
     if (splitFlatCorners(B) == 0) break;
   }
+  Mesh best;
   for (int round = 0;; ++round) {
     optimize.fixed = boundaryNodes(W.M);
     const int inverted = optimizeMesh(W.M, optimize).inverted;
     W.progress("fixed boundary: " + sizeText(W.M) + ", " + std::to_string(inverted) + " inverted");
-    if (inverted >= fewest) ++waited;
-    if (inverted == 0 || waited == patience || round == maxRounds) return inverted;
-    fewest = std::min(fewest, inverted);
+    if (inverted == 0) return 0;
+    if (inverted >= fewest)
+      ++waited;
+    else
+      fewest = inverted, best = W.M;
+    if (waited == patience || round == maxRounds) break;
     Bisection B(W.M);
     const std::vector<double> q = qualities(W.M);
     for (std::size_t E = 0; E < q.size(); ++E)
       if (q[E] <= 0) B.bisect(static_cast<int>(E));
   }
+  W.M = std::move(best);
+  return fewest;
 }
 
 /// The largest distance of Π from a flat face with one of its nodes at another place.
@@ -3100,6 +3106,9 @@ OptimizeReport slideWithin(Mesher& W, double allowed, bool lift, std::vector<int
   return optimizeMesh(W.M, optimize);
 }
 
+/// [choice] Inverted elements that a sliding boundary may free.
+constexpr int fewTangled = 60;
+
 /// [departure] Of ε, one after the other where the mesh refined to ε at once is tangled: each
 /// starts from the valid mesh of the one before, whose boundary has slid into place, so that few
 /// elements turn over at a time and long ways are gone on coarse meshes.
@@ -3114,15 +3123,14 @@ int approachGradually(Mesher& W, const Mesh& initial) {
     refineToDistance(W, eps);
     const Mesh refined = W.M;
     left = untangleFixed(W, false);
-    if (left > 0) {
+    if (left > fewTangled) {
       W.M = refined;
       placeInterior(W.M);
       left = untangleFixed(W, false);
     }
-    if (left > 0 && factor > 1)
-      W.M = refined;
-    else if (factor > 1 && !W.options.fixedBoundary)
-      slideWithin(W, eps, false);
+    if (!W.options.fixedBoundary && left <= fewTangled && (factor > 1 || left > 0))
+      left = slideWithin(W, eps, false).inverted;
+    if (left > fewTangled) W.M = refined;
   }
   return left;
 }
@@ -3164,7 +3172,6 @@ std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
 
 /// qualityOptimization with ∂Ω prepared; `initial` is the mesh before its refinement.
 void optimizeQuality(Mesher& W, const Mesh& initial) {
-  constexpr int fewInverted = 60;
   const double eps = sampledEps * W.options.eps;
   const bool slid = untangleWithin(W, initial, eps);
   W.report.untangled = qualityStatistics(W.M);
@@ -3186,7 +3193,7 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
     if (!within) refineToDistance(W, eps);
     if (!within || o.inverted > 0) {
       // a few that stay are left to the next round, whose boundary slides
-      if (untangleFixed(W, false) > fewInverted) break;
+      if (untangleFixed(W, false) > fewTangled) break;
     }
     const QualityStatistics q = qualityStatistics(W.M);
     if (q.inverted == 0 && q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
