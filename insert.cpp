@@ -2797,7 +2797,8 @@ FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBo
     double longest = 0;
     for (int i = 0; i < 3; ++i)
       longest = std::max(longest, norm(M.x[face.n[i]] - M.x[face.n[(i + 1) % 3]]));
-    wanted = std::max(wanted, static_cast<int>(std::min<double>(most, longest / enough)));
+    const double spacing = wanted > steps ? enough / 3 : enough;
+    wanted = std::max(wanted, static_cast<int>(std::min<double>(most, longest / spacing)));
   }
   if (wanted > steps) sampleFace(M, face, Omega, enough, wanted, d);
   return d;
@@ -3128,25 +3129,31 @@ bool SlideGuard::accept(int n, Vec3 x, Vec2 parameter) {
   return true;
 }
 
+/// A boundary that slides between refinements, at last, and once more where a few faces had to be
+/// refined again.
+enum class Slide { between, atLast, again };
+
 /// Algorithm 2 on all nodes, first on the active ones (none given: all); a boundary node is not
-/// moved where a face beside it gets farther than allowed and worse. Then, if wanted, the worst
-/// elements are lifted.
-OptimizeReport slideWithin(Mesher& W, double allowed, bool lift, std::vector<int> active = {}) {
+/// moved where a face beside it gets farther than allowed and worse. At last the worst elements are
+/// lifted.
+OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide, std::vector<int> active = {}) {
   // [choice] Sweeps: what is left to do after these goes on for hundreds, at the kinks of Π.
   constexpr int sweepsBetween = 30, sweepsAtLast = 60, sweepsOfLift = 300;
+  constexpr double restOfLift = .2;  // maxDisp before it: new nodes come to their places
   SlideGuard guard(W, allowed);
   OptimizeOptions optimize = W.options.optimize;
   optimize.globalDescent = false;
   optimize.starDelta = true;
-  optimize.power = 1;
-  optimize.maxSweeps = lift ? sweepsAtLast : sweepsBetween;
-  optimize.active = std::move(active);
   optimize.accept = [&](int n, Vec3 x, Vec2 parameter) { return guard.accept(n, x, parameter); };
-  const OptimizeReport report = optimizeMesh(W.M, optimize);
-  W.progress("  slide: " + counted(report.sweeps, "sweep") + " min " + number(report.minQ) + " mean " + number(report.meanQ));
-  if (!lift || report.inverted > 0) return report;
+  if (slide != Slide::again) {
+    optimize.power = 1;
+    optimize.maxSweeps = slide == Slide::between ? sweepsBetween : sweepsAtLast;
+    const OptimizeReport report = optimizeMesh(W.M, optimize);
+    if (slide == Slide::between || report.inverted > 0) return report;
+  }
+  optimize.active = std::move(active);
   optimize.power = W.options.optimize.power;
-  optimize.maxDisp = 1;  // the sweep before it is no more than a test
+  optimize.maxDisp = restOfLift;
   optimize.maxSweeps = sweepsOfLift;
   return optimizeMesh(W.M, optimize);
 }
@@ -3174,7 +3181,7 @@ int approachGradually(Mesher& W, const Mesh& initial) {
       left = untangleFixed(W, false);
     }
     if (!W.options.fixedBoundary && left <= fewTangled && (factor > 1 || left > 0))
-      left = slideWithin(W, eps, false).inverted;
+      left = slideWithin(W, eps, Slide::between).inverted;
     if (left > fewTangled) W.M = refined;
   }
   return left;
@@ -3202,8 +3209,23 @@ bool untangleWithin(Mesher& W, const Mesh& initial, double eps) {
 
 /// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide
 /// far, and what they leave is refined; in the end hardly any face exceeds ε.
-constexpr double guards[] = {3, 1.5, .8, .8, .8, .8};
-constexpr int firstOfLast = 2;  // the rounds from here on end with what they reach
+constexpr double guards[] = {3, 1.5, .8, .8, .8, .8, .8, .8, .8};
+constexpr int firstIfSlid = 1, firstOfLast = 2;  // the rounds from here on may be the last
+
+/// [departure] Elements of lower quality that sweeps do not raise, most of them between boundary
+/// nodes that the guard holds, are bisected: more nodes free them. But only those near the lowest.
+constexpr double stuckQuality = .3, stuckPart = 1.2;
+
+/// Returns the number of these.
+int bisectStuck(Mesher& W, double lowest) {
+  if (lowest >= stuckQuality) return 0;
+  Bisection B(W.M);
+  const std::vector<double> q = qualities(W.M);
+  int stuck = 0;
+  for (std::size_t E = 0; E < q.size(); ++E)
+    if (q[E] < std::min(stuckQuality, stuckPart * lowest)) B.bisect(static_cast<int>(E)), ++stuck;
+  return stuck;
+}
 
 /// Nodes of the tetrahedra at nodes from `first` on: where a refinement has been.
 std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
@@ -3217,6 +3239,18 @@ std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
   return nodes;
 }
 
+/// The valid mesh within eps of highest lowest quality so far.
+struct BestMesh {
+  Mesh M;
+  double lowest = -1;  // none yet
+
+  void keep(Mesher& W, double distance, double eps, int round) {
+    const QualityStatistics q = qualityStatistics(W.M);
+    if (q.inverted > 0 || q.min <= lowest || distance > eps) return;
+    M = W.M, lowest = q.min, W.report.rounds = round;
+  }
+};
+
 /// qualityOptimization with ∂Ω prepared; `initial` is the mesh before its refinement.
 void optimizeQuality(Mesher& W, const Mesh& initial) {
   const double eps = sampledEps * W.options.eps;
@@ -3224,31 +3258,36 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
   W.report.untangled = qualityStatistics(W.M);
   W.stage("untangled");
   if (W.options.fixedBoundary) return;
-  Mesh valid = W.M;
-  double best = 0;
+  BestMesh best;
+  best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, 0);
   std::vector<int> active;  // none: all
+  Slide slide = Slide::between;
   const int rounds = static_cast<int>(std::size(guards));
-  for (int round = slid ? firstOfLast : 0; round < rounds; ++round) {
+  for (int round = slid ? firstIfSlid : 0; round < rounds; ++round) {
     const bool last = round >= firstOfLast;
-    const OptimizeReport o = slideWithin(W, guards[round] * eps, last, active);
-    const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
+    if (last && slide == Slide::between) slide = Slide::atLast;
+    const OptimizeReport o = slideWithin(W, guards[round] * eps, slide, active);
+    const double d = distanceTo(W.M, W.Omega, eps).largest();
     W.progress("round " + std::to_string(round + 1) + ": " + sizeText(W.M) + ", min " +
-               number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " +
-               number(d.largest()) + ", " + std::to_string(o.inverted) + " inverted");
-    const bool within = d.largest() <= eps;
+               number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " + number(d) + ", " +
+               std::to_string(o.inverted) + " inverted");
+    best.keep(W, d, eps, round + 1);
     const std::size_t nodes = W.M.x.size();
-    if (!within) refineToDistance(W, eps);
-    if (!within || o.inverted > 0) {
-      // a few that stay are left to the next round, whose boundary slides
-      if (untangleFixed(W, false) > fewTangled) break;
-    }
-    const QualityStatistics q = qualityStatistics(W.M);
-    if (q.inverted == 0 && q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
-      best = q.min, valid = W.M, W.report.rounds = round + 1;
-    if (within && last && q.inverted == 0) break;
-    if (last && q.inverted == 0) active = nodesNear(W.M, nodes);
+    const int stuck = last && o.inverted == 0 ? bisectStuck(W, o.minQ) : 0;
+    if (last && d <= eps && o.inverted == 0 && stuck == 0) break;
+    refineToDistance(W, eps);
+    // a few that stay are left to the next round, whose boundary slides
+    const int inverted = untangleFixed(W, false);
+    if (inverted > fewTangled) break;
+    best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, round + 1);
+    if (last) slide = stuck == 0 && inverted == 0 ? Slide::again : Slide::atLast;
+    active = slide == Slide::again ? nodesNear(W.M, nodes) : std::vector<int>{};
   }
-  W.M = std::move(valid);
+  if (best.lowest < 0)
+    throw MethodError("meccanoMesher (§2): no mesh is valid and within eps = " +
+                      number(W.options.eps) + " after " + std::to_string(rounds) +
+                      " rounds; lower eps, or give a polycube that fits the solid better");
+  W.M = std::move(best.M);
 }
 
 void checkOptions(const MesherOptions& options) {
