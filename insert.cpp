@@ -3129,6 +3129,8 @@ bool SlideGuard::accept(int n, Vec3 x, Vec2 parameter) {
   return true;
 }
 
+constexpr double stuckQuality = .3, stuckPart = 1.2;
+
 /// A boundary that slides between refinements, at last, and once more where a few faces had to be
 /// refined again.
 enum class Slide { between, atLast, again };
@@ -3152,9 +3154,14 @@ OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide, std::vector<i
     if (slide == Slide::between || report.inverted > 0) return report;
   }
   optimize.active = std::move(active);
-  optimize.power = W.options.optimize.power;
   optimize.maxDisp = restOfLift;
   optimize.maxSweeps = sweepsOfLift;
+  if (slide == Slide::again) {
+    optimize.power = 1;
+    const OptimizeReport report = optimizeMesh(W.M, optimize);
+    if (report.minQ > stuckQuality) return report;
+  }
+  optimize.power = W.options.optimize.power;
   return optimizeMesh(W.M, optimize);
 }
 
@@ -3209,21 +3216,22 @@ bool untangleWithin(Mesher& W, const Mesh& initial, double eps) {
 
 /// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide
 /// far, and what they leave is refined; in the end hardly any face exceeds ε.
-constexpr double guards[] = {3, 1.5, .8, .8, .8, .8, .8, .8, .8};
+constexpr double guards[] = {3, 2, .8, .8, .8, .8, .8, .8, .8};
 constexpr int firstIfSlid = 1, firstOfLast = 2;  // the rounds from here on may be the last
 
 /// [departure] Elements of lower quality that sweeps do not raise, most of them between boundary
 /// nodes that the guard holds, are bisected: more nodes free them. But only those near the lowest.
-constexpr double stuckQuality = .3, stuckPart = 1.2;
-
 /// Returns the number of these.
 int bisectStuck(Mesher& W, double lowest) {
   if (lowest >= stuckQuality) return 0;
   Bisection B(W.M);
   const std::vector<double> q = qualities(W.M);
   int stuck = 0;
-  for (std::size_t E = 0; E < q.size(); ++E)
-    if (q[E] < std::min(stuckQuality, stuckPart * lowest)) B.bisect(static_cast<int>(E)), ++stuck;
+  for (std::size_t E = 0; E < q.size(); ++E) {
+    bool held = false;
+    for (int label : W.M.faceLabel[E]) held |= label < 0;
+    if (held && q[E] < std::min(stuckQuality, stuckPart * lowest)) B.bisect(static_cast<int>(E)), ++stuck;
+  }
   return stuck;
 }
 
