@@ -810,8 +810,7 @@ MeccanoSurface::MeccanoSurface(const Meccano& C) {
 
 }  // namespace
 
-// ==== Tools for 2: Floater's equations solved by elimination
-// ======================================
+// ==== Tools for 2: Floater's equations solved by elimination ==================================
 
 namespace {
 
@@ -942,8 +941,7 @@ void solveConvexCombinations(const std::vector<Vec3>& points, const SparseMatrix
 
 }  // namespace
 
-// ==== 2. Algorithm 1: Π on the boundary
-// ===========================================================
+// ==== 2. Algorithm 1: Π on the boundary =======================================================
 
 namespace {
 
@@ -3137,11 +3135,13 @@ enum class Slide { between, atLast, again };
 
 /// Algorithm 2 on all nodes, first on the active ones (none given: all); a boundary node is not
 /// moved where a face beside it gets farther than allowed and worse. At last the worst elements are
-/// lifted.
-OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide, std::vector<int> active = {}) {
+/// lifted, and again where the lowest quality has fallen below that before.
+OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide,
+                           const std::vector<int>& active = {}, double before = 0) {
   // [choice] Sweeps: what is left to do after these goes on for hundreds, at the kinks of Π.
   constexpr int sweepsBetween = 30, sweepsAtLast = 60, sweepsOfLift = 300;
   constexpr double restOfLift = .2;  // maxDisp before it: new nodes come to their places
+  constexpr double keptPart = .95;   // of the lowest quality before: it need not be lifted again
   SlideGuard guard(W, allowed);
   OptimizeOptions optimize = W.options.optimize;
   optimize.globalDescent = false;
@@ -3153,13 +3153,13 @@ OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide, std::vector<i
     const OptimizeReport report = optimizeMesh(W.M, optimize);
     if (slide == Slide::between || report.inverted > 0) return report;
   }
-  optimize.active = std::move(active);
+  optimize.active = active;
   optimize.maxDisp = restOfLift;
   optimize.maxSweeps = sweepsOfLift;
   if (slide == Slide::again) {
     optimize.power = 1;
     const OptimizeReport report = optimizeMesh(W.M, optimize);
-    if (report.minQ > stuckQuality) return report;
+    if (report.minQ > stuckQuality && report.minQ > keptPart * before) return report;
   }
   optimize.power = W.options.optimize.power;
   return optimizeMesh(W.M, optimize);
@@ -3187,26 +3187,32 @@ int approachGradually(Mesher& W, const Mesh& initial) {
       placeInterior(W.M);
       left = untangleFixed(W, false);
     }
-    if (!W.options.fixedBoundary && left <= fewTangled && (factor > 1 || left > 0))
-      left = slideWithin(W, eps, Slide::between).inverted;
+    if (factor == 1 || W.options.fixedBoundary) continue;
+    if (left <= fewTangled) left = slideWithin(W, eps, Slide::between).inverted;
     if (left > fewTangled) W.M = refined;
   }
   return left;
 }
 
-/// The first valid mesh within eps. Returns whether its boundary has slid already.
+/// The first valid mesh, within eps but where its boundary has slid. Returns whether it has.
 bool untangleWithin(Mesher& W, const Mesh& initial, double eps) {
   constexpr int maxRounds = 10;  // the last refinement may turn elements over again
+  const bool fixed = W.options.fixedBoundary;
   placeInterior(W.M);
-  if (qualityStatistics(W.M).inverted > 0 && !W.options.fixedBoundary) {
-    const Mesh refined = W.M;
-    if (approachGradually(W, initial) == 0) return true;
-    W.M = refined;
+  const Mesh refined = W.M;
+  if (!fixed && qualityStatistics(refined).inverted > 0 && approachGradually(W, initial) == 0)
+    return true;
+  const Mesh approached = W.M;
+  W.M = refined;
+  int left = untangleFixed(W, fixed);
+  if (left > 0 && fixed) left = approachGradually(W, initial);
+  if (left > 0 && !fixed) {
+    W.M = approached;
+    left = slideWithin(W, eps, Slide::between).inverted;
+    if (left == 0) return true;
   }
-  int left = untangleFixed(W, W.options.fixedBoundary);
-  if (left > 0 && W.options.fixedBoundary) left = approachGradually(W, initial);
   for (int round = 0; left == 0 && refineToDistance(W, eps) > 0 && round < maxRounds; ++round)
-    left = untangleFixed(W, W.options.fixedBoundary);
+    left = untangleFixed(W, fixed);
   if (left > 0)
     throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
                       " elements stay inverted with the boundary fixed; lower eps, or give a "
@@ -3247,15 +3253,16 @@ std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
   return nodes;
 }
 
-/// The valid mesh within eps of highest lowest quality so far.
+/// The valid mesh within eps of highest lowest quality so far; before the last rounds any.
 struct BestMesh {
   Mesh M;
   double lowest = -1;  // none yet
 
   void keep(Mesher& W, double distance, double eps, int round) {
     const QualityStatistics q = qualityStatistics(W.M);
-    if (q.inverted > 0 || q.min <= lowest || distance > eps) return;
-    M = W.M, lowest = q.min, W.report.rounds = round;
+    const double reached = round > firstOfLast ? q.min : 0;
+    if (q.inverted > 0 || reached < lowest || distance > eps) return;
+    M = W.M, lowest = reached, W.report.rounds = round;
   }
 };
 
@@ -3270,16 +3277,18 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
   best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, 0);
   std::vector<int> active;  // none: all
   Slide slide = Slide::between;
+  double lowest = 0;
   const int rounds = static_cast<int>(std::size(guards));
   for (int round = slid ? firstIfSlid : 0; round < rounds; ++round) {
     const bool last = round >= firstOfLast;
     if (last && slide == Slide::between) slide = Slide::atLast;
-    const OptimizeReport o = slideWithin(W, guards[round] * eps, slide, active);
+    const OptimizeReport o = slideWithin(W, guards[round] * eps, slide, active, lowest);
     const double d = distanceTo(W.M, W.Omega, eps).largest();
     W.progress("round " + std::to_string(round + 1) + ": " + sizeText(W.M) + ", min " +
                number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " + number(d) + ", " +
                std::to_string(o.inverted) + " inverted");
     best.keep(W, d, eps, round + 1);
+    lowest = o.minQ;
     const std::size_t nodes = W.M.x.size();
     const int stuck = last && o.inverted == 0 ? bisectStuck(W, o.minQ) : 0;
     if (last && d <= eps && o.inverted == 0 && stuck == 0) break;
