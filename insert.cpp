@@ -4,6 +4,7 @@
 // approximation and its healing, surface extraction and its healing, surface projection; and
 // insertSurface, which calls them in the paper's order. Section 3.7 is optimize.cpp.
 #include <algorithm>
+#include <cfloat>
 #include <cstdint>
 #include <cstdio>
 #include <map>
