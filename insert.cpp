@@ -4,7 +4,6 @@
 // approximation and its healing, surface extraction and its healing, surface projection; and
 // insertSurface, which calls them in the paper's order. Section 3.7 is optimize.cpp.
 #include <algorithm>
-#include <cfloat>
 #include <cstdint>
 #include <cstdio>
 #include <map>
@@ -2785,22 +2784,21 @@ void sampleFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& O
 }
 
 FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& Omega,
-                         double enough, double scale) {
-  constexpr int least = 5, most = 64;  // [choice] steps: 18 points of each face, 2142
+                         double enough, double largest) {
+  constexpr int steps = 5, finer = 11, most = 64;  // [choice] 18 points of each face, 93, 2142
   FaceDistance d;
-  sampleFace(M, face, Omega, enough, least, d);
-  if (enough > 0 && std::max(d.toSolid, d.toFace) > enough) return d;
-  double longest = 0;
-  for (int i = 0; i < 3; ++i)
-    longest = std::max(longest, norm(M.x[face.n[i]] - M.x[face.n[(i + 1) % 3]]));
-  int steps = least;
-  for (int perScale : {1, 3}) {  // points on a large face: no farther from each other than this
-    if (perScale == 3 && std::max(d.toSolid, d.toFace) <= nearLargest * scale) break;
-    const double wanted = std::max(perScale * longest / scale, perScale == 3 ? 2. * least + 1 : 0);
-    if (wanted <= steps) continue;
-    steps = static_cast<int>(std::min<double>(most, wanted));
-    sampleFace(M, face, Omega, enough, steps, d);
+  sampleFace(M, face, Omega, enough, steps, d);
+  const double so = std::max(d.toSolid, d.toFace);
+  if (enough > 0 && so > enough) return d;
+  int wanted = so > nearLargest * std::max(enough, largest) ? finer : steps;
+  if (enough > 0) {  // points on a large face no farther from each other than what is enough
+    double longest = 0;
+    for (int i = 0; i < 3; ++i)
+      longest = std::max(longest, norm(M.x[face.n[i]] - M.x[face.n[(i + 1) % 3]]));
+    const double spacing = wanted > steps ? enough / 3 : enough;
+    wanted = std::max(wanted, static_cast<int>(std::min<double>(most, longest / spacing)));
   }
+  if (wanted > steps) sampleFace(M, face, Omega, enough, wanted, d);
   return d;
 }
 
@@ -2878,14 +2876,9 @@ BoundaryDistance distanceTo(const Mesh& M, const CurvedBoundary& Omega, double e
       if (isKnown) result.toSolid = std::max(result.toSolid, known.d.ofFace[E][i]);
     }
   }
-  double scale = enough;
   for (const BoundaryFace& face : faces) {
-    if (enough > 0) break;
-    const double d = sampledFace(M, face, Omega, 0, DBL_MAX).toSolid;
-    scale = std::max({scale, d, DBL_MIN});
-  }
-  for (const BoundaryFace& face : faces) {
-    const FaceDistance d = sampledFace(M, face, Omega, enough, scale);
+    const FaceDistance d =
+        sampledFace(M, face, Omega, enough, std::max(result.toSolid, result.toMesh));
     result.ofFace[face.at.E][face.at.i] = std::max(d.toSolid, d.toFace);
     result.toSolid = std::max(result.toSolid, d.toSolid);
     result.toMesh = std::max(result.toMesh, d.toFace);
