@@ -194,6 +194,7 @@ Measured meshOf(Row& row, const Arguments& a, Mesh& M) {
   if (row.top > 0) {
     T = row.file.empty() ? samples::island(129) : readTerrain(a.data + "/" + row.file);
     T.top = row.top;
+    if (!row.layers.heights.empty()) T.cells = {T.nx > T.ny ? 10 : 8, T.nx > T.ny ? 8 : 10, 3};
     options.eps = row.part / .002 * terrainEps(T);
     m.q = meccanoMesher(M, T, options).smoothed;
     row.D = groundOf(T);
