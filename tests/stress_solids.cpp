@@ -148,7 +148,7 @@ void measureDistances(const Mesh& M, const TriangleSurface& D, bool terrain, dou
 
 /// The layers of a row, one call of insertSurface each.
 QualityStatistics insertLayers(const Row& row, const Terrain& T, Mesh& M) {
-  constexpr double lc = 700, margin = 2600;  // m; cells of 400 m
+  constexpr double lc = 660, margin = 2600;  // m; cells of 400 m
   InsertOptions options;
   options.lc = lc, options.optimize.threads = 1;
   QualityStatistics q;
