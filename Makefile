@@ -5,6 +5,7 @@
 # make bench      time of each stage            make samples samples/ anew from its generator
 # make pictures   samples/cube_sine/*.svg       make faults  four faults in a box, samples/faults
 # make stress-real  the surfaces of ../shared/data, where it is
+# make stress-solids  Algorithm 1 on solids, terrains, layers, those of ../shared/data where it is
 # make pollutant  Section 4.3.2 on samples/layers: wind, transport, files in build/pollutant
 # make bench-optimize  the optimizer on the cases of ../shared/bench, where it is
 CXX      ?= g++
@@ -101,11 +102,11 @@ bench-optimize: $(BUILD)/tests/bench_optimize
 	  for p in python3 /usr/bin/python3; do \
 	    $$p $(CASES) $(BUILD)/cases 2>/dev/null && break; done; fi
 	$< $(BUILD)/cases $(ARGS)
-stress-real: $(BUILD)/tests/stress_real
+stress-real stress-solids: stress-%: $(BUILD)/tests/stress_%
 	$< $(ARGS)
 clean:
 	rm -rf $(BUILD) $(PROGRAM)
 
-.PHONY: all demo pictures faults test audit asan asan-3 asan-others stress stress-real bench bench-optimize samples pollutant clean
+.PHONY: all demo pictures faults test audit asan asan-3 asan-others stress stress-real stress-solids bench bench-optimize samples pollutant clean
 .SECONDARY:
 -include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d $(BUILD)/*/*/*.d)

@@ -193,7 +193,7 @@ std::vector<std::vector<int>> cellsOf(const Parametrization& P) {
   return cells;
 }
 
-constexpr int crowded = 16;  // triangles in a box that is halved; a vertex may well have 12
+constexpr int crowded = 6;  // triangles in a box that is halved; a vertex may well have 12
 
 /// Halves a run of P.gridTriangles, across the longer side of its box, down to few in a box.
 /// Returns the number of its box. The recursion is as deep as the logarithm of the run's length.
@@ -225,14 +225,20 @@ int addBoxes(Parametrization& P, int first, int last) {
   return number;
 }
 
+constexpr double farOutside = -1e-8;  // barycentric: well below the tolerance of locate
+
 /// Looks for u among a run of P.gridTriangles. Returns whether it is inside one of them.
 bool locateIn(const Parametrization& P, Vec2 u, int first, int last, Location& best,
               double& bestInside) {
   for (int i = first; i < last; ++i) {
     const std::array<int, 3>& t = P.triangles[P.gridTriangles[i]];
     const Vec2 a = P.u[t[0]] - u, b = P.u[t[1]] - u, c = P.u[t[2]] - u;
-    const double area = cross(b - a, c - a);
-    const double w0 = cross(b, c) / area, w1 = cross(c, a) / area, w2 = 1 - w0 - w1;
+    const double area = cross(b - a, c - a), ofA = cross(b, c), ofB = cross(c, a);
+    // most triangles are left here: clearly outside, without a division
+    const double outside = farOutside * std::abs(area), side = area < 0 ? -1 : 1;
+    if (side * ofA < outside || side * ofB < outside || side * (area - ofA - ofB) < outside)
+      continue;
+    const double w0 = ofA / area, w1 = ofB / area, w2 = 1 - w0 - w1;
     const double inside = std::min({w0, w1, w2});
     if (inside > bestInside) {
       bestInside = inside;
@@ -804,8 +810,7 @@ MeccanoSurface::MeccanoSurface(const Meccano& C) {
 
 }  // namespace
 
-// ==== Tools for 2: Floater's equations solved by elimination
-// ======================================
+// ==== Tools for 2: Floater's equations solved by elimination ==================================
 
 namespace {
 
@@ -936,8 +941,7 @@ void solveConvexCombinations(const std::vector<Vec3>& points, const SparseMatrix
 
 }  // namespace
 
-// ==== 2. Algorithm 1: Π on the boundary
-// ===========================================================
+// ==== 2. Algorithm 1: Π on the boundary =======================================================
 
 namespace {
 
@@ -2756,12 +2760,16 @@ std::array<Vec3, 3> placesOf(const Mesh& M, const std::array<int, 3>& n) {
 struct FaceDistance {
   double toSolid = 0, toFace = 0;
 };
-FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& Omega,
-                         double enough) {
-  constexpr int steps = 5;  // [choice] 18 points of each face
+
+/// [choice] Where the distance comes as near to the largest so far, or to what is enough, it is
+/// sampled more densely: what lies between the first samples has been up to 8 % farther.
+constexpr double nearLargest = .75;
+
+/// Adds the samples of one lattice to d.
+void sampleFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& Omega, double enough,
+                int steps, FaceDistance& d) {
   const std::array<Vec3, 3> x = placesOf(M, face.n);
   const Parametrization& P = surfaceOf(M, face.label);
-  FaceDistance d;
   anySample(steps, [&](double a, double b, double c) {
     const Sampled at = sampled(P, x, face.u, a, b, c);
     const double bound = norm(at.onSolid - at.onFace);
@@ -2773,37 +2781,78 @@ FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBo
     d.toFace = std::max(d.toFace, closestPointOnTriangle(at.onSolid, x[0], x[1], x[2]).distance);
     return false;
   });
+}
+
+FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& Omega,
+                         double enough, double largest) {
+  constexpr int steps = 5, finer = 11, most = 64;  // [choice] 18 points of each face, 93, 2142
+  FaceDistance d;
+  sampleFace(M, face, Omega, enough, steps, d);
+  const double so = std::max(d.toSolid, d.toFace);
+  if (enough > 0 && so > enough) return d;
+  int wanted = so > nearLargest * std::max(enough, largest) ? finer : steps;
+  if (enough > 0) {  // points on a large face no farther from each other than what is enough
+    double longest = 0;
+    for (int i = 0; i < 3; ++i)
+      longest = std::max(longest, norm(M.x[face.n[i]] - M.x[face.n[(i + 1) % 3]]));
+    const double spacing = wanted > steps ? enough / 3 : enough;
+    wanted = std::max(wanted, static_cast<int>(std::min<double>(most, longest / spacing)));
+  }
+  if (wanted > steps) sampleFace(M, face, Omega, enough, wanted, d);
   return d;
 }
 
-/// The distance of each point of a patch from the face that holds its parameter.
+/// ∂M over the 𝓤 of a patch.
+struct FlatPatch {
+  Parametrization flat;
+  std::vector<const BoundaryFace*> of;  // [triangles]
+
+  FlatPatch(const Mesh& M, const std::vector<BoundaryFace>& faces, int label) {
+    for (const BoundaryFace& face : faces) {
+      if (face.label != label) continue;
+      const int first = static_cast<int>(flat.points.size());
+      for (int j = 0; j < 3; ++j) {
+        flat.points.push_back(M.x[face.n[j]]);
+        flat.u.push_back(face.u[j]);
+      }
+      flat.triangles.push_back({first, first + 1, first + 2});
+      of.push_back(&face);
+    }
+    buildLocator(flat);
+  }
+};
+
+/// The distance of each point of a patch from the face that holds its parameter; of points on the
+/// edges between them where that is large.
 void measurePatch(const Mesh& M, const std::vector<BoundaryFace>& faces, int label, double enough,
                   BoundaryDistance& result) {
+  constexpr int pieces = 4;  // [choice] of such an edge
   const Parametrization& P = surfaceOf(M, label);
-  Parametrization flat;  // ∂M over the same 𝓤
-  std::vector<const BoundaryFace*> of;
-  for (const BoundaryFace& face : faces) {
-    if (face.label != label) continue;
-    const int first = static_cast<int>(flat.points.size());
-    for (int j = 0; j < 3; ++j) {
-      flat.points.push_back(M.x[face.n[j]]);
-      flat.u.push_back(face.u[j]);
-    }
-    flat.triangles.push_back({first, first + 1, first + 2});
-    of.push_back(&face);
-  }
-  buildLocator(flat);
-  for (std::size_t k = 0; k < P.points.size(); ++k) {
-    const Location at = locate(flat, P.u[k]);
-    if (at.triangle < 0) continue;  // on the border of 𝓤, within rounding: a neighbour has it
-    double d = norm(P.points[k] - varphi(flat, at));
-    const std::array<Vec3, 3> x = placesOf(M, of[at.triangle]->n);
-    if (d > enough) d = closestPointOnTriangle(P.points[k], x[0], x[1], x[2]).distance;
-    const BoundaryTriangle face = of[at.triangle]->at;
+  const FlatPatch F(M, faces, label);
+  auto measure = [&](Vec3 x, Vec2 u) {
+    const Location at = locate(F.flat, u);
+    if (at.triangle < 0) return 0.;  // on the border of 𝓤, within rounding: a neighbour has it
+    double d = norm(x - varphi(F.flat, at));
+    const std::array<Vec3, 3> y = placesOf(M, F.of[at.triangle]->n);
+    if (d > enough) d = closestPointOnTriangle(x, y[0], y[1], y[2]).distance;
+    const BoundaryTriangle face = F.of[at.triangle]->at;
     double& ofFace = result.ofFace[face.E][face.i];
     ofFace = std::max(ofFace, d);
     result.toMesh = std::max(result.toMesh, d);
-  }
+    return d;
+  };
+  std::vector<double> d(P.points.size());
+  for (std::size_t k = 0; k < P.points.size(); ++k) d[k] = measure(P.points[k], P.u[k]);
+  const double nearby = nearLargest * std::max(enough, result.toMesh);
+  for (const std::array<int, 3>& t : P.triangles)
+    for (int i = 0; i < 3; ++i) {
+      const int a = t[i], b = t[(i + 1) % 3];
+      if (a > b || std::max(d[a], d[b]) <= nearby) continue;  // an edge of two triangles once
+      for (int k = 1; k < pieces; ++k) {
+        const double part = double(k) / pieces;
+        measure(P.points[a] + part * (P.points[b] - P.points[a]), P.u[a] + part * (P.u[b] - P.u[a]));
+      }
+    }
 }
 
 /// The distance of the faces of elements before a refinement; those that are left keep it.
@@ -2828,7 +2877,8 @@ BoundaryDistance distanceTo(const Mesh& M, const CurvedBoundary& Omega, double e
     }
   }
   for (const BoundaryFace& face : faces) {
-    const FaceDistance d = sampledFace(M, face, Omega, enough);
+    const FaceDistance d =
+        sampledFace(M, face, Omega, enough, std::max(result.toSolid, result.toMesh));
     result.ofFace[face.at.E][face.at.i] = std::max(d.toSolid, d.toFace);
     result.toSolid = std::max(result.toSolid, d.toSolid);
     result.toMesh = std::max(result.toMesh, d.toFace);
@@ -3000,18 +3050,24 @@ int untangleFixed(Mesher& W, bool smooth) {
     Bisection B(W.M);
     if (splitFlatCorners(B) == 0) break;
   }
+  Mesh best;
   for (int round = 0;; ++round) {
     optimize.fixed = boundaryNodes(W.M);
     const int inverted = optimizeMesh(W.M, optimize).inverted;
     W.progress("fixed boundary: " + sizeText(W.M) + ", " + std::to_string(inverted) + " inverted");
-    if (inverted >= fewest) ++waited;
-    if (inverted == 0 || waited == patience || round == maxRounds) return inverted;
-    fewest = std::min(fewest, inverted);
+    if (inverted == 0) return 0;
+    if (inverted >= fewest)
+      ++waited;
+    else
+      fewest = inverted, best = W.M;
+    if (waited == patience || round == maxRounds) break;
     Bisection B(W.M);
     const std::vector<double> q = qualities(W.M);
     for (std::size_t E = 0; E < q.size(); ++E)
       if (q[E] <= 0) B.bisect(static_cast<int>(E));
   }
+  W.M = std::move(best);
+  return fewest;
 }
 
 /// The largest distance of Π from a flat face with one of its nodes at another place.
@@ -3030,72 +3086,225 @@ double movedFaceDistance(const Mesh& M, const BoundaryFace& face, double enough)
   return most;
 }
 
-/// Algorithm 2 on all nodes; a boundary node is not moved where a face beside it gets farther than
-/// allowed and worse.
-OptimizeReport slideWithin(Mesher& W, double allowed, bool last) {
-  Mesh& M = W.M;
-  std::vector<std::vector<BoundaryTriangle>> facesAt(M.x.size());
-  for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
-    for (int i = 0; i < 4; ++i)
-      if (M.faceLabel[E][i] < 0 && W.Omega.curved[-M.faceLabel[E][i] - 1])
-        for (int j = 1; j < 4; ++j) facesAt[M.tets[E][(i + j) % 4]].push_back({E, i});
+/// Keeps the curved faces of ∂M near Π while their nodes slide.
+struct SlideGuard {
+  Mesh& M;
+  double allowed;
+  std::vector<BoundaryTriangle> faces;
+  std::vector<double> bound;             // [faces] of the distance, as far as it is known
+  std::vector<std::vector<int>> facesAt;  // [nodes]
+
+  SlideGuard(Mesher& W, double most) : M(W.M), allowed(most), facesAt(W.M.x.size()) {
+    for (int E = 0; E < static_cast<int>(M.tets.size()); ++E)
+      for (int i = 0; i < 4; ++i)
+        if (M.faceLabel[E][i] < 0 && W.Omega.curved[-M.faceLabel[E][i] - 1]) {
+          for (int j = 1; j < 4; ++j)
+            facesAt[M.tets[E][(i + j) % 4]].push_back(static_cast<int>(faces.size()));
+          faces.push_back({E, i});
+        }
+    bound.assign(faces.size(), 1e300);
+  }
+  /// Whether node n may move there: no face beside it gets farther than allowed and worse.
+  bool accept(int n, Vec3 x, Vec2 parameter);
+};
+
+bool SlideGuard::accept(int n, Vec3 x, Vec2 parameter) {
+  // [choice] A face's distance grows by this part of a node's step at most; by 2 were Π isometric.
+  constexpr double growth = 3;
+  const double step = growth * norm(x - M.x[n]);
+  std::vector<double> after;
+  for (int f : facesAt[n]) {
+    after.push_back(bound[f] + step);
+    if (after.back() <= allowed) continue;
+    std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
+    after.back() = movedFaceDistance(M, boundaryFace(M, faces[f]), allowed);
+    std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
+    if (after.back() > allowed &&
+        after.back() >= movedFaceDistance(M, boundaryFace(M, faces[f]), allowed))
+      return false;
+  }
+  for (std::size_t k = 0; k < after.size(); ++k) bound[facesAt[n][k]] = after[k];
+  return true;
+}
+
+constexpr double stuckQuality = .3, stuckPart = 1.2;
+
+/// A boundary that slides between refinements, at last, and once more where a few faces had to be
+/// refined again.
+enum class Slide { between, atLast, again };
+
+/// Algorithm 2 on all nodes, first on the active ones (none given: all); a boundary node is not
+/// moved where a face beside it gets farther than allowed and worse. At last the worst elements are
+/// lifted, and again where the lowest quality has fallen below that before.
+OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide,
+                           const std::vector<int>& active = {}, double before = 0) {
+  // [choice] Sweeps: what is left to do after these goes on for hundreds, at the kinks of Π.
+  constexpr int sweepsBetween = 30, sweepsAtLast = 60, sweepsOfLift = 300;
+  constexpr double restOfLift = .2;  // maxDisp before it: new nodes come to their places
+  constexpr double keptPart = .95;   // of the lowest quality before: it need not be lifted again
+  SlideGuard guard(W, allowed);
   OptimizeOptions optimize = W.options.optimize;
   optimize.globalDescent = false;
   optimize.starDelta = true;
-  if (!last) optimize.power = 1;
-  optimize.accept = [&](int n, Vec3 x, Vec2 parameter) {
-    bool good = true;
-    for (const BoundaryTriangle& at : facesAt[n]) {
-      std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
-      const double after = movedFaceDistance(M, boundaryFace(M, at), allowed);
-      std::swap(M.x[n], x), std::swap(M.parameter[n], parameter);
-      good = after <= allowed || after < movedFaceDistance(M, boundaryFace(M, at), allowed);
-      if (!good) break;
+  optimize.accept = [&](int n, Vec3 x, Vec2 parameter) { return guard.accept(n, x, parameter); };
+  if (slide != Slide::again) {
+    optimize.power = 1;
+    optimize.maxSweeps = slide == Slide::between ? sweepsBetween : sweepsAtLast;
+    const OptimizeReport report = optimizeMesh(W.M, optimize);
+    if (slide == Slide::between || report.inverted > 0) return report;
+  }
+  optimize.active = active;
+  optimize.maxDisp = restOfLift;
+  optimize.maxSweeps = sweepsOfLift;
+  if (slide == Slide::again) {
+    optimize.power = 1;
+    const OptimizeReport report = optimizeMesh(W.M, optimize);
+    if (report.minQ > stuckQuality && report.minQ > keptPart * before) return report;
+  }
+  optimize.power = W.options.optimize.power;
+  return optimizeMesh(W.M, optimize);
+}
+
+/// [choice] Inverted elements that a sliding boundary may free.
+constexpr int fewTangled = 60;
+
+/// [departure] Of ε, one after the other where the mesh refined to ε at once is tangled: each
+/// starts from the valid mesh of the one before, whose boundary has slid into place, so that few
+/// elements turn over at a time and long ways are gone on coarse meshes.
+constexpr double approach[] = {16, 8, 4, 2, 1};
+
+/// From the initial mesh to ε in these steps. Returns the number of inverted elements left.
+int approachGradually(Mesher& W, const Mesh& initial) {
+  int left = 0;
+  W.M = initial;
+  for (double factor : approach) {
+    const double eps = factor * sampledEps * W.options.eps;
+    refineToDistance(W, eps);
+    const Mesh refined = W.M;
+    left = untangleFixed(W, false);
+    if (left > fewTangled) {
+      W.M = refined;
+      placeInterior(W.M);
+      left = untangleFixed(W, false);
     }
-    return good;
-  };
-  return optimizeMesh(M, optimize);
+    if (factor == 1 || W.options.fixedBoundary) continue;
+    if (left <= fewTangled) left = slideWithin(W, eps, Slide::between).inverted;
+    if (left > fewTangled) W.M = refined;
+  }
+  return left;
+}
+
+/// The first valid mesh, within eps but where its boundary has slid. Returns whether it has.
+bool untangleWithin(Mesher& W, const Mesh& initial, double eps) {
+  constexpr int maxRounds = 10;  // the last refinement may turn elements over again
+  const bool fixed = W.options.fixedBoundary;
+  placeInterior(W.M);
+  const Mesh refined = W.M;
+  if (!fixed && qualityStatistics(refined).inverted > 0 && approachGradually(W, initial) == 0)
+    return true;
+  const Mesh approached = W.M;
+  W.M = refined;
+  int left = untangleFixed(W, fixed);
+  if (left > 0 && fixed) left = approachGradually(W, initial);
+  if (left > 0 && !fixed) {
+    W.M = approached;
+    left = slideWithin(W, eps, Slide::between).inverted;
+    if (left == 0) return true;
+  }
+  for (int round = 0; left == 0 && refineToDistance(W, eps) > 0 && round < maxRounds; ++round)
+    left = untangleFixed(W, fixed);
+  if (left > 0)
+    throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
+                      " elements stay inverted with the boundary fixed; lower eps, or give a "
+                      "polycube that fits the solid better");
+  return false;
 }
 
 /// [choice] Of ε, in each round: farther faces must not get worse by sliding. First nodes slide
 /// far, and what they leave is refined; in the end hardly any face exceeds ε.
-constexpr double guard[] = {3, 1.5, .8, .8, .8, .8};
+constexpr double guards[] = {3, 2, .8, .8, .8, .8, .8, .8, .8};
+constexpr int firstIfSlid = 1, firstOfLast = 2;  // the rounds from here on may be the last
 
-/// qualityOptimization with ∂Ω prepared.
-void optimizeQuality(Mesher& W) {
+/// [departure] Elements of lower quality that sweeps do not raise, most of them between boundary
+/// nodes that the guard holds, are bisected: more nodes free them. But only those near the lowest.
+/// Returns the number of these.
+int bisectStuck(Mesher& W, double lowest) {
+  if (lowest >= stuckQuality) return 0;
+  Bisection B(W.M);
+  const std::vector<double> q = qualities(W.M);
+  int stuck = 0;
+  for (std::size_t E = 0; E < q.size(); ++E) {
+    bool held = false;
+    for (int label : W.M.faceLabel[E]) held |= label < 0;
+    if (held && q[E] < std::min(stuckQuality, stuckPart * lowest)) B.bisect(static_cast<int>(E)), ++stuck;
+  }
+  return stuck;
+}
+
+/// Nodes of the tetrahedra at nodes from `first` on: where a refinement has been.
+std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
+  std::vector<char> near(M.x.size(), 0);
+  for (const std::array<int, 4>& z : M.tets)
+    if (std::size_t(*std::max_element(z.begin(), z.end())) >= first)
+      for (int n : z) near[n] = 1;
+  std::vector<int> nodes;
+  for (int n = 0; n < static_cast<int>(near.size()); ++n)
+    if (near[n]) nodes.push_back(n);
+  return nodes;
+}
+
+/// The valid mesh within eps of highest lowest quality so far; before the last rounds any.
+struct BestMesh {
+  Mesh M;
+  double lowest = -1;  // none yet
+
+  void keep(Mesher& W, double distance, double eps, int round) {
+    const QualityStatistics q = qualityStatistics(W.M);
+    const double reached = round > firstOfLast ? q.min : 0;
+    if (q.inverted > 0 || reached < lowest || distance > eps) return;
+    M = W.M, lowest = reached, W.report.rounds = round;
+  }
+};
+
+/// qualityOptimization with ∂Ω prepared; `initial` is the mesh before its refinement.
+void optimizeQuality(Mesher& W, const Mesh& initial) {
   const double eps = sampledEps * W.options.eps;
-  placeInterior(W.M);
-  if (const int left = untangleFixed(W, W.options.fixedBoundary); left > 0)
-    throw MethodError("meccanoMesher (§2): " + std::to_string(left) +
-                      " elements stay inverted with the boundary fixed; lower eps, or give a "
-                      "polycube that fits the solid better");
-  refineToDistance(W, eps);
+  const bool slid = untangleWithin(W, initial, eps);
   W.report.untangled = qualityStatistics(W.M);
   W.stage("untangled");
   if (W.options.fixedBoundary) return;
-  constexpr int fewInverted = 60;
-  Mesh valid = W.M;
-  double best = 0;
-  const int rounds = static_cast<int>(std::size(guard));
-  for (int round = 1; round <= rounds; ++round) {
-    const bool last = guard[round - 1] < 1;
-    const OptimizeReport o = slideWithin(W, guard[round - 1] * eps, last);
-    const BoundaryDistance d = distanceTo(W.M, W.Omega, eps);
-    W.progress("round " + std::to_string(round) + ": " + sizeText(W.M) + ", min " + number(o.minQ) +
-               ", mean " + number(o.meanQ) + ", distance " + number(d.largest()) + ", " +
+  BestMesh best;
+  best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, 0);
+  std::vector<int> active;  // none: all
+  Slide slide = Slide::between;
+  double lowest = 0;
+  const int rounds = static_cast<int>(std::size(guards));
+  for (int round = slid ? firstIfSlid : 0; round < rounds; ++round) {
+    const bool last = round >= firstOfLast;
+    if (last && slide == Slide::between) slide = Slide::atLast;
+    const OptimizeReport o = slideWithin(W, guards[round] * eps, slide, active, lowest);
+    const double d = distanceTo(W.M, W.Omega, eps).largest();
+    W.progress("round " + std::to_string(round + 1) + ": " + sizeText(W.M) + ", min " +
+               number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " + number(d) + ", " +
                std::to_string(o.inverted) + " inverted");
-    const bool within = d.largest() <= eps;
-    if (!within) refineToDistance(W, eps);
-    if (!within || o.inverted > 0) {
-      // a few that stay are left to the next round, whose boundary slides
-      if (untangleFixed(W, false) > fewInverted) break;
-    }
-    const QualityStatistics q = qualityStatistics(W.M);
-    if (q.inverted == 0 && q.min > best && distanceTo(W.M, W.Omega, eps).largest() <= eps)
-      best = q.min, valid = W.M, W.report.rounds = round;
-    if (within && last && q.inverted == 0) break;
+    best.keep(W, d, eps, round + 1);
+    lowest = o.minQ;
+    const std::size_t nodes = W.M.x.size();
+    const int stuck = last && o.inverted == 0 ? bisectStuck(W, o.minQ) : 0;
+    if (last && d <= eps && o.inverted == 0 && stuck == 0) break;
+    refineToDistance(W, eps);
+    // a few that stay are left to the next round, whose boundary slides
+    const int inverted = untangleFixed(W, false);
+    if (inverted > fewTangled) break;
+    best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, round + 1);
+    if (last) slide = stuck == 0 && inverted == 0 ? Slide::again : Slide::atLast;
+    active = slide == Slide::again ? nodesNear(W.M, nodes) : std::vector<int>{};
   }
-  W.M = std::move(valid);
+  if (best.lowest < 0)
+    throw MethodError("meccanoMesher (§2): no mesh is valid and within eps = " +
+                      number(W.options.eps) + " after " + std::to_string(rounds) +
+                      " rounds; lower eps, or give a polycube that fits the solid better");
+  W.M = std::move(best.M);
 }
 
 void checkOptions(const MesherOptions& options) {
@@ -3115,7 +3324,7 @@ void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& re
   checkOptions(options.optimize, M.x.size());
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
-  optimizeQuality(W);
+  optimizeQuality(W, M);
   M = std::move(work);
 }
 
@@ -3135,7 +3344,7 @@ MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
   W.stage("refined");
   W.progress("refined: " + sizeText(work) + " after " + std::to_string(report.passes) +
              " passes, " + std::to_string(report.refined.inverted) + " inverted");
-  optimizeQuality(W);
+  optimizeQuality(W, M);
   report.distance = distanceTo(work, W.Omega, 0);
   report.smoothed = qualityStatistics(work);
   report.regular = qualityStatistics(work, Ideal::regular);

@@ -11,7 +11,7 @@
 #include <utility>
 #include <vector>
 
-#include "../meccano.hpp"
+#include "shapes.hpp"
 
 namespace solids {
 
@@ -162,6 +162,45 @@ inline meccano::Meccano placed(const std::vector<Cube>& cubes,
     if (bends == 3) C.corners.push_back({p, map({double(p[0]), double(p[1]), double(p[2])})});
   }
   return C;
+}
+
+/// A smooth map without symmetry that leaves a polycube's shape recognizable.
+inline Vec3 warped(Vec3 p) {
+  return {p.x + .15 * std::sin(2 * p.y + 1), p.y + .12 * std::sin(1.7 * p.x),
+          p.z * (1 + .2 * std::cos(p.x + p.y))};
+}
+/// Places of its corners that miss them.
+inline Vec3 roughly(Vec3 p) { return warped(p) + Vec3{.13, -.1, .12}; }
+/// From the lattice of ring() to a torus of radius 1 with a tube of .4.
+inline Vec3 aroundTorus(Vec3 p) {
+  return {.9 * (p.x - 1.5), .9 * (p.y - 1.5), .8 * (p.z - .5)};
+}
+
+/// The boundary faces of a mesh.
+inline std::vector<std::array<int, 3>> boundaryOf(const meccano::Mesh& M) {
+  std::vector<std::array<int, 3>> all;
+  for (std::size_t p = 1; p <= M.patches.size(); ++p)
+    for (const auto& face : meccano::surfaceFaces(M, -static_cast<int>(p))) all.push_back(face);
+  return all;
+}
+
+/// The largest distance of points sampled on the triangles from the surface: the nearest by a tree
+/// of the library, measured again by the tests' own distance.
+inline double sampledDistance(const std::vector<Vec3>& x,
+                              const std::vector<std::array<int, 3>>& faces,
+                              const TriangleSurface& S, int steps) {
+  const meccano::TriangleTree tree(S.points, S.triangles);
+  double most = 0;
+  for (const auto& f : faces)
+    for (int a = 0; a <= steps; ++a)
+      for (int b = 0; a + b <= steps; ++b) {
+        const double s = double(a) / steps, t = double(b) / steps;
+        const Vec3 p = s * x[f[0]] + t * x[f[1]] + (1 - s - t) * x[f[2]];
+        const std::array<int, 3> v = S.triangles[tree.closest(p).triangle];
+        most = std::max(
+            most, shapes::distanceToTriangle(p, S.points[v[0]], S.points[v[1]], S.points[v[2]]));
+      }
+  return most;
 }
 
 }  // namespace solids

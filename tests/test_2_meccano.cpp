@@ -24,13 +24,6 @@ TriangleSurface checked(const TriangleSurface& S) {
   return checkSolid(S, warnings);
 }
 
-/// A smooth map without symmetry that leaves a polycube's shape recognizable.
-Vec3 warped(Vec3 p) {
-  return {p.x + .15 * std::sin(2 * p.y + 1), p.y + .12 * std::sin(1.7 * p.x),
-          p.z * (1 + .2 * std::cos(p.x + p.y))};
-}
-Vec3 roughly(Vec3 p) { return warped(p) + Vec3{.13, -.1, .12}; }
-
 struct MappedSolid {
   std::string name;
   TriangleSurface D;
@@ -45,13 +38,11 @@ std::vector<MappedSolid> mappedSolids() {
       {"blob", solids::blob(10), {}},
   };
   for (MappedSolid& s : all) s.C = getMeccano(s.D);
-  all.push_back({"L of three cubes", solids::polycube(solids::ell(), 6, warped),
-                 solids::placed(solids::ell(), roughly)});
-  all.push_back({"torus", solids::torus(1, .4, 14), solids::placed(solids::ring(), [](Vec3 p) {
-                   return Vec3{.9 * (p.x - 1.5), .9 * (p.y - 1.5), .8 * (p.z - .5)};
-                 })});
-  all.push_back({"two handles", solids::polycube(solids::twoHandles(), 4, warped),
-                 solids::placed(solids::twoHandles(), roughly)});
+  all.push_back({"L of three cubes", solids::polycube(solids::ell(), 6, solids::warped),
+                 solids::placed(solids::ell(), solids::roughly)});
+  all.push_back({"torus", solids::torus(1, .4, 14), solids::placed(solids::ring(), solids::aroundTorus)});
+  all.push_back({"two handles", solids::polycube(solids::twoHandles(), 4, solids::warped),
+                 solids::placed(solids::twoHandles(), solids::roughly)});
   return all;
 }
 
@@ -330,8 +321,8 @@ TEST_SUITE("2") {
   }
 
   TEST_CASE("cubes anywhere in the lattice, in any order, give the same mesh from 0 on") {
-    const TriangleSurface D = solids::polycube(solids::ell(), 4, warped);
-    const Meccano C = solids::placed(solids::ell(), roughly);
+    const TriangleSurface D = solids::polycube(solids::ell(), 4, solids::warped);
+    const Meccano C = solids::placed(solids::ell(), solids::roughly);
     Meccano far = C;
     std::reverse(far.cubes.begin(), far.cubes.end());
     std::reverse(far.corners.begin(), far.corners.end());

@@ -11,32 +11,6 @@ using namespace meccano;
 
 namespace {
 
-/// The boundary faces of a mesh, all or of one patch.
-std::vector<std::array<int, 3>> boundaryOf(const Mesh& M) {
-  std::vector<std::array<int, 3>> all;
-  for (std::size_t p = 1; p <= M.patches.size(); ++p)
-    for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) all.push_back(face);
-  return all;
-}
-
-/// The largest distance of points sampled on the triangles from the surface, by brute force over
-/// the nearest by a tree of the library, re-measured by the tests' own distance.
-double sampledDistance(const std::vector<Vec3>& x, const std::vector<std::array<int, 3>>& faces,
-                       const TriangleSurface& S, int steps) {
-  const TriangleTree tree(S.points, S.triangles);
-  double most = 0;
-  for (const auto& f : faces)
-    for (int a = 0; a <= steps; ++a)
-      for (int b = 0; a + b <= steps; ++b) {
-        const double s = double(a) / steps, t = double(b) / steps;
-        const Vec3 p = s * x[f[0]] + t * x[f[1]] + (1 - s - t) * x[f[2]];
-        const std::array<int, 3> v = S.triangles[tree.closest(p).triangle];
-        most = std::max(
-            most, shapes::distanceToTriangle(p, S.points[v[0]], S.points[v[1]], S.points[v[2]]));
-      }
-  return most;
-}
-
 MesherOptions withEps(double eps) {
   MesherOptions options;
   options.eps = eps;
@@ -104,7 +78,7 @@ TEST_SUITE("2") {
           fine.triangles.push_back({k - n - 2, k, k - 1});
         }
       }
-    CHECK(sampledDistance(fine.points, fine.triangles, S, 1) <= 4);
+    CHECK(solids::sampledDistance(fine.points, fine.triangles, S, 1) <= 4);
   }
 
   TEST_CASE("Algorithm 1: the sides of a terrain box stay in their planes, the top flat") {
@@ -177,11 +151,11 @@ TEST_SUITE("2") {
     for (const Mesh* m : {&M, &fixed}) {
       CHECK(shapes::countInverted(*m) == 0);
       CHECK(shapes::conformityFault(*m) == "");
-      const auto faces = boundaryOf(*m);
+      const auto faces = solids::boundaryOf(*m);
       TriangleSurface own;
       own.points = m->x, own.triangles = faces;
-      CHECK(sampledDistance(m->x, faces, S, 6) <= eps);
-      CHECK(sampledDistance(S.points, S.triangles, own, 4) <= eps);
+      CHECK(solids::sampledDistance(m->x, faces, S, 6) <= eps);
+      CHECK(solids::sampledDistance(S.points, S.triangles, own, 4) <= eps);
     }
     CHECK(r.smoothed.min >= .5);
     CHECK(r.smoothed.mean >= f.smoothed.mean);
