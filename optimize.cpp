@@ -662,6 +662,7 @@ struct Smoother {
   // [nodes] whether a node of the star has moved since the last visit. Atomic, for nodes of one
   // colour share neighbours; all write 1.
   std::vector<std::atomic<unsigned char>> awake = {};
+  std::vector<unsigned char> reached = {};  // [nodes] moved by more than `wake` before the lift
   double wake = 0;  // displacement, relative to the shortest edge, from which neighbours awake
 
   double delta = 0;      // of the sweep, relative to the mean σ
@@ -1084,7 +1085,9 @@ double visitRows(Smoother& S, int begin, int end) {
     const double moved = smoothNode(S, row, visit);
     disp = std::max(disp, moved);
     awake.store(moved > S.wake, std::memory_order_relaxed);
-    if (moved > S.wake) wakeNeighbours(S, row);
+    if (moved <= S.wake) continue;
+    wakeNeighbours(S, row);
+    if (S.penalty.scale == 0) S.reached[S.order[row]] = 1;
   }
   return disp;
 }
@@ -1551,15 +1554,25 @@ constexpr double liftReach = .85;     // (η/η_w)^64 below it is nothing
 constexpr double liftRatio =
     1.6;  // η/η_w at most: 1.6^64 = 1e13, and a Newton step lowers it e-fold
 
-/// q of the elements, the lowest, the mean, and what bounds the worst elements from above.
+/// q of the elements, the lowest, the mean, and what bounds the worst elements from above; of those
+/// that the sweeps have reached, since the others, as those at earlier surfaces, were lifted before.
 struct WorstElements {
   std::vector<double> q;
-  double lowest, mean, bound;
+  double lowest = 1, mean = 1, bound = 1;
 };
 
 WorstElements worstElements(const Smoother& S) {
-  WorstElements worst{qualitiesOf(S), 0, 0, 0};
-  std::vector<double> q = worst.q;
+  constexpr double notReached = 2;  // above every q
+  WorstElements worst{qualitiesOf(S)};
+  std::vector<double> q;
+  for (std::size_t E = 0; E < worst.q.size(); ++E) {
+    const std::array<int, 4>& z = S.M.tets[E];
+    if (S.reached[z[0]] || S.reached[z[1]] || S.reached[z[2]] || S.reached[z[3]])
+      q.push_back(worst.q[E]);
+    else
+      worst.q[E] = notReached;
+  }
+  if (q.empty()) return worst;
   const double count = static_cast<double>(q.size());
   const std::size_t wanted = std::max(worstCount, static_cast<std::size_t>(worstFraction * count));
   const auto bound = q.begin() + static_cast<std::ptrdiff_t>(std::min(q.size(), wanted)) - 1;
@@ -1722,6 +1735,7 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   buildStars(S);
   buildSheets(S);
   S.awake = std::vector<std::atomic<unsigned char>>(M.x.size());
+  S.reached.assign(M.x.size(), options.active.empty());
   for (int n : options.active.empty() ? S.order : options.active) wakeNode(S, n);
 
   S.report.converged = untangleAndSmooth(S);
