@@ -7,9 +7,10 @@
 # make stress-real  the surfaces of ../shared/data, where it is
 # make stress-solids  Algorithm 1 on solids, terrains, layers, those of ../shared/data where it is
 # make pollutant  Section 4.3.2 on samples/layers: wind, transport, files in build/pollutant
+# make bench-peers  Gmsh beside us on one surface, where it is installed
 # make bench-optimize  the optimizer on the cases of ../shared/bench, where it is
 CXX      ?= g++
-CXXFLAGS ?= -O2 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-sign-conversion
+CXXFLAGS ?= -O3 -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Wno-sign-conversion
 EXTRA    ?=
 BUILD    ?= build
 PROGRAM  ?= meccano
@@ -102,11 +103,14 @@ bench-optimize: $(BUILD)/tests/bench_optimize
 	  for p in python3 /usr/bin/python3; do \
 	    $$p $(CASES) $(BUILD)/cases 2>/dev/null && break; done; fi
 	$< $(BUILD)/cases $(ARGS)
+bench-peers: $(PROGRAM)
+	@sh tests/bench_peers.sh $(abspath $(PROGRAM)) $(BUILD)/peers
 stress-real stress-solids: stress-%: $(BUILD)/tests/stress_%
 	$< $(ARGS)
 clean:
 	rm -rf $(BUILD) $(PROGRAM)
 
-.PHONY: all demo pictures faults test audit asan asan-3 asan-others stress stress-real stress-solids bench bench-optimize samples pollutant clean
+.PHONY: all demo pictures faults test audit asan asan-3 asan-others stress stress-real \
+  stress-solids bench bench-optimize bench-peers samples pollutant clean
 .SECONDARY:
 -include $(wildcard $(BUILD)/*.d $(BUILD)/*/*.d $(BUILD)/*/*/*.d)

@@ -3858,6 +3858,7 @@ ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
   if (nodes.empty()) return best;
   visitNearest(*this, 0, boxDistance(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
+    if (boxDistance(boxOf(corners[i]), {x, x}) > best.distance * (1 + boxMargin)) return;
     ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
     p.triangle = triangle[i];
     const bool lower = p.distance == best.distance && p.triangle < best.triangle;
@@ -4007,19 +4008,28 @@ bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
   return false;
 }
 
+/// Whether x is not farther than this from the tree's triangles: the first one found so near will do.
+bool isWithin(const TriangleTree& tree, Vec3 x, double distance) {
+  double bound = distance;  // −1 ends the search
+  visitNearest(tree, 0, boxDistance(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
+    const std::array<Vec3, 3>& c = tree.corners[i];
+    if (bound >= 0 && closestPointOnTriangle(x, c[0], c[1], c[2]).distance <= distance) bound = -1;
+  });
+  return bound < 0;
+}
+
 /// Largest distance of points of A, a lattice of `least` steps on each triangle or of more that are
-/// no longer than `spacing`, from B, and the point.
-Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing) {
+/// no longer than `spacing`, from B, and the point, where it is above `largest`.
+Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
+                      Width largest = {0, {}}) {
   constexpr double mostSteps = 1000;
-  Width largest{0, {}};
   for (const std::array<Vec3, 3>& c : A.corners) {
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
     for (int i = 0; i <= m; ++i)
       for (int j = 0; i + j <= m; ++j) {
         const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
-        const double distance = B.closest(p).distance;
-        if (distance > largest.distance) largest = {distance, p};
+        if (!isWithin(B, p, largest.distance)) largest = {B.closest(p).distance, p};
       }
   }
   return largest;
@@ -4148,8 +4158,7 @@ Width farthestPoint(const TriangleTree& A, const TriangleTree& B, int samplesPer
   if (A.nodes.empty() || B.nodes.empty() || samplesPerEdge < 1 || !(spacing > 0))
     throw InputError("hausdorffDistance: give two surfaces with triangles and samplesPerEdge >= 1");
   const Width ofA = sampledDistance(A, B, samplesPerEdge, spacing);
-  const Width ofB = sampledDistance(B, A, samplesPerEdge, spacing);
-  return ofA.distance < ofB.distance ? ofB : ofA;
+  return sampledDistance(B, A, samplesPerEdge, spacing, ofA);
 }
 
 double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
@@ -5134,12 +5143,10 @@ void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistan
   }
 }
 
-}  // namespace
-
-Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
-                             int side, Outline outline) {
+/// surfaceExtraction() with the survey, which is the same for all ways.
+Extraction extractSurface(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                          Survey survey, int side, Outline outline) {
   constexpr int maxRounds = 50;
-  Survey survey = surveySquares(M, Q, S);
   markSharpCorners(M, Q, S, side, survey);
   Extraction result;
   result.selected = selectSquares(Q, survey, side);
@@ -5163,6 +5170,13 @@ Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const Surfac
   }
   if (result.fault.empty()) result.energy = rim.energy() + uncovered(M, Q, S, result.selected);
   return result;
+}
+
+}  // namespace
+
+Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                             int side, Outline outline) {
+  return extractSurface(M, Q, S, surveySquares(M, Q, S), side, outline);
 }
 
 namespace {
@@ -6244,6 +6258,7 @@ struct Insertion {
   Mesh M = {};  // refined by §3.2 and §3.3
   Approximation A = {};
   SquareSurface Q = {};
+  Survey survey = {};
   int ways = 0;    // tried so far, over all l_c
   int faults = 0;  // and left; why the last one was, without prefix and advice
   std::string reason = {};
@@ -6296,11 +6311,15 @@ std::string leftOut(const Insertion& I, const Selection& selected) {
   return "";
 }
 
+/// [choice] Sides whose rim energies differ by no more are as good as mirrored, and end alike (to
+/// .004 in the lowest q): one is enough.
+constexpr double mirrored = .01;
+
 /// §3.4 on both sides: the ways to go on with this outline, best first.
 std::vector<Way> extractWays(Insertion& I, Outline outline) {
   std::vector<Way> ways;
   for (int side : {1, -1}) {
-    Way way{side, outline, surfaceExtraction(I.M, I.Q, I.S, side, outline)};
+    Way way{side, outline, extractSurface(I.M, I.Q, I.S, I.survey, side, outline)};
     const std::string missing =
         way.extraction.fault.empty() ? leftOut(I, way.extraction.selected) : "";
     if (!missing.empty())
@@ -6314,8 +6333,10 @@ std::vector<Way> extractWays(Insertion& I, Outline outline) {
                           way.extraction.fault));
     I.isBlocked = I.isBlocked || way.extraction.isBlocked;
   }
-  if (ways.size() == 2 && ways[1].extraction.energy < ways[0].extraction.energy)
-    std::swap(ways[0], ways[1]);
+  if (ways.size() < 2) return ways;
+  const double first = ways[0].extraction.energy, second = ways[1].extraction.energy;
+  if (second < first) std::swap(ways[0], ways[1]);
+  if (std::abs(first - second) < mirrored * std::max(first, second)) ways.pop_back();
   return ways;
 }
 
@@ -6445,13 +6466,13 @@ constexpr double poorHausdorff = .3, poorWorth = .6;
 
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
-  constexpr double badHausdorff = .5;  // [choice] of l_c: refused
+  constexpr double badHausdorff = .45;  // [choice] of l_c: refused
   constexpr double poorShift = 2;      // [choice] of h: warned of
   const std::string found = "the Hausdorff distance S_M - S is " + number(report.hausdorff) +
                             " near " + placeText(report.hausdorffPlace);
   if (report.hausdorff > badHausdorff * report.lc)
     throw MethodError("insertSurface (§3.6): " + found +
-                      ", above half of l_c: S has a part narrower than the cubes");
+                      ", above .45 l_c: S has a part narrower than the cubes");
   if (report.hausdorff > poorHausdorff * report.lc)
     report.warnings.push_back(found + ", above .3 l_c: S bends or narrows there within the cubes" +
                               "; lower l_c");
@@ -6459,6 +6480,9 @@ void judgeSurface(double h, InsertReport& report) {
     report.warnings.push_back("the projection moved a node " + number(report.tangentialShift) +
                               " along S, more than 2 cube edges; lower l_c");
 }
+
+/// [choice] A way is better than another one where its lowest q is higher by more.
+constexpr double betterBy = .01;
 
 /// Follows one way; keeps its mesh and report where it is the best valid one so far.
 void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport& report) {
@@ -6482,7 +6506,7 @@ void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport&
   // beside earlier surfaces the lowest q may be theirs, on every way
   double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
   if (ofThisWay.hausdorff > poorHausdorff * lc) lowest *= poorWorth;
-  if (report.surface == 0 || lowest > I.lowest)
+  if (report.surface == 0 || lowest > I.lowest + betterBy)
     report = ofThisWay, result = std::move(trial), I.lowest = lowest;
 }
 
@@ -6513,6 +6537,7 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   if (!I.Q.fault.empty() && I.options.outline == Outline::paper)
     throw MethodError("insertSurface (§3.3): " + I.Q.fault + "; lower l_c");
   if (!I.Q.fault.empty()) I.progress("3.3 healing: " + I.Q.fault + "; S_M may still be a disk");
+  I.survey = surveySquares(I.M, I.Q, I.S);
   I.stage("healed", I.M);
   I.progress("3.2-3.3 approximation: " + std::to_string(I.M.tets.size()) + " tetrahedra, " +
              std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
@@ -6798,7 +6823,7 @@ std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurf
   std::vector<InsertReport> reports;
   for (const Candidate& one : all)
     reports.push_back(labelled(one.label, [&] { return insertCandidate(result, one, options); }));
-  for (std::size_t i = 0; i < all.size(); ++i)  // later ones have refined and moved earlier ones
+  for (std::size_t i = 0; i + 1 < all.size(); ++i)  // later ones have refined and moved earlier ones
     labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i]); });
   M = std::move(result);
   return reports;

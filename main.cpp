@@ -3188,8 +3188,12 @@ class Progress {
     endSweeps();
     if (!quiet_) io_.err << text << std::endl;
   }
+  /// For onSweep, which costs a pass over the mesh: none where nobody looks.
+  std::function<void(const Sweep&)> sweeps() {
+    if (quiet_ || !io_.terminal) return nullptr;
+    return [this](const Sweep& s) { sweep(s); };
+  }
   void sweep(const Sweep& s) {
-    if (quiet_ || !io_.terminal) return;
     const char* pattern = "\r\033[Ksweep %d  inverted %d  min q %.4f  displacement %.2g";
     io_.err << format(pattern, s.number, s.inverted, s.minQ, s.disp) << std::flush;
     sweeping_ = true;
@@ -3279,7 +3283,7 @@ MesherOptions mesherOptions(const Arguments& a, Progress& progress) {
   o.optimize.power = a.number("--power", o.optimize.power);
   o.optimize.threads = a.number("--threads", 0);
   o.onProgress = [&progress](const std::string& line) { progress.line(line); };
-  o.optimize.onSweep = [&progress](const Sweep& s) { progress.sweep(s); };
+  o.optimize.onSweep = progress.sweeps();
   return o;
 }
 
@@ -3485,7 +3489,7 @@ void runInsert(const Arguments& a, const Streams& io) {
   stages.keep("original", M, 0, 0);
   options.onStage = [&](const char* stage, const Mesh& mesh) { stages.see(stage, mesh); };
   options.onProgress = [&](const std::string& line) { progress.line(line); };
-  options.optimize.onSweep = [&](const Sweep& s) { progress.sweep(s); };
+  options.optimize.onSweep = progress.sweeps();
   const std::vector<InsertReport> reports = insertSurfaces(M, surfaces, options);
   std::vector<Output> outputs{{path, meshText(path, M)}};
   stages.take(reports, outputs);
@@ -3554,7 +3558,7 @@ void runOptimize(const Arguments& a, const Streams& io) {
     progress.line(std::to_string(options.fixed.size()) +
                   " required or labelled nodes inside stay where they are");
   const QualityStatistics original = qualityStatistics(M);
-  options.onSweep = [&](const Sweep& s) { progress.sweep(s); };
+  options.onSweep = progress.sweeps();
   const OptimizeReport r = optimizeMesh(M, options);
   if (r.inverted > 0)
     throw MethodError("optimize: " + std::to_string(r.inverted) +
@@ -3688,7 +3692,7 @@ struct Command {
 constexpr Option outputOption{"-o", "OUT", "the mesh to write: .vtk, .msh (Gmsh), .mesh (MEDIT)"};
 constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
 constexpr Option powerOption{
-    "--power", "P", "exponent of the term that lifts the worst elements (default 48; 1: none)"};
+    "--power", "P", "exponent of the term that lifts the worst elements (default 64; 1: none)"};
 constexpr Option threadsOption{
     "--threads", "N", "threads that smooth (default 0: all cores); the result is the same for any"};
 constexpr Option maxTetsOption{

@@ -200,9 +200,9 @@ struct Sweep {
 struct OptimizeOptions {
   double maxDisp = 1e-2;  // Algorithm 2's maxDisp, relative to the node's shortest edge; > 0
   int maxSweeps = 300;    // bound of Algorithm 2's loop; >= 1
-  // [§3.7.4 departure] Once valid and converged, the worst 1 % of the elements are lifted by Σ η +
+  // [§3.7.4 departure] Once valid and settled, the worst elements are lifted by Σ η +
   // (η/η_w)^power.
-  double power = 48;                  // [1, 64], 1: none
+  double power = 64;                  // [1, 64], 1: none
   bool numericalDerivatives = false;  // §3.7.3: derivatives in u and s by differences, as printed
   // most meshes are valid after 20; then [departure] the global descent, if wanted
   int maxTangledSweeps = 60;
@@ -232,7 +232,9 @@ struct OptimizeOptions {
 struct OptimizeReport {
   int sweeps = 0;          // of all phases
   double disp = 0;         // of Algorithm 2's last sweep (before the worst elements), as maxDisp
-  bool converged = false;  // valid and disp <= maxDisp before maxSweeps
+  // valid and disp <= maxDisp (where the worst elements are lifted next: its root mean square <= 2
+  // maxDisp) before maxSweeps
+  bool converged = false;
   int inverted = 0;        // elements with σ <= 0 left
   double minQ = 0, meanQ = 0;
 };

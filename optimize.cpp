@@ -662,6 +662,7 @@ struct Smoother {
   // [nodes] whether a node of the star has moved since the last visit. Atomic, for nodes of one
   // colour share neighbours; all write 1.
   std::vector<std::atomic<unsigned char>> awake = {};
+  std::vector<unsigned char> reached = {};  // [nodes] moved by more than `wake` before the lift
   double wake = 0;  // displacement, relative to the shortest edge, from which neighbours awake
 
   double delta = 0;      // of the sweep, relative to the mean σ
@@ -1084,7 +1085,9 @@ double visitRows(Smoother& S, int begin, int end) {
     const double moved = smoothNode(S, row, visit);
     disp = std::max(disp, moved);
     awake.store(moved > S.wake, std::memory_order_relaxed);
-    if (moved > S.wake) wakeNeighbours(S, row);
+    if (moved <= S.wake) continue;
+    wakeNeighbours(S, row);
+    if (S.penalty.scale == 0) S.reached[S.order[row]] = 1;
   }
   return disp;
 }
@@ -1151,6 +1154,8 @@ class Anderson {
   explicit Anderson(Smoother& smoother) : S(smoother) {}
   void beforeSweep() { start_ = states(); }
   void afterSweep();
+  /// Root mean square of the inner nodes' displacements in the last sweep, in local edges.
+  double meanDisp() const { return std::sqrt(last_ / std::max(1, rows())); }
 
  private:
   using Change = std::array<float, 3>;  // a trial only: few digits will do
@@ -1466,7 +1471,11 @@ void globalDescent(Smoother& S) {
 // ---- Algorithm 2 -------------------------------------------------------------------------------
 
 constexpr double acceleratedRelaxation = 1.5;  // of sweeps that are mixed
-constexpr double wakeFraction = .1;       // of maxDisp: a star that moved less is not visited again
+constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is not visited again;
+/// [departure] where the worst elements are lifted afterwards, which smooths all others too: so much
+/// of it, and the sweeps end where the root mean square of the displacements is as small. To sweep
+/// on until no node moves took 2 to 10 times the visits for the same qualities in the end.
+constexpr double settledFraction = 2;
 constexpr int sweepsWithoutProgress = 3;  // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
@@ -1501,7 +1510,8 @@ struct MuSchedule {
 bool untangleAndSmooth(Smoother& S) {
   MuSchedule schedule;
   bool tangled = true;
-  S.wake = wakeFraction * S.options.maxDisp;
+  const double settled = S.options.power > 1 ? settledFraction * S.options.maxDisp : 0;
+  S.wake = std::max(wakeFraction * S.options.maxDisp, settled);
   Anderson acceleration(S);
   while (sweepsLeft(S)) {
     const Validity v = tangled ? validity(S) : Validity{0, 1};
@@ -1523,33 +1533,46 @@ bool untangleAndSmooth(Smoother& S) {
     S.report.disp = sweepNodes(S);
     if (!tangled && S.report.disp <= S.options.maxDisp) return true;
     if (accelerated) acceleration.afterSweep();
+    if (accelerated && acceleration.meanDisp() <= settled) return true;
   }
   return false;
 }
 
 // ---- the worst elements ------------------------------------------------------------------------
 
-constexpr double worstFraction = .01;   // of the elements count as the worst ones,
+constexpr double worstFraction = .004;  // of the elements count as the worst ones,
 constexpr std::size_t worstCount = 10;  // but at least so many
-constexpr int liftRounds = 15, liftSweeps = 8;
+constexpr int liftRounds = 15, liftSweeps = 4, lastSweeps = 8;
 constexpr double liftMeanLoss =
     .015;  // of mean q: the rounds end there (the last one wins most back),
 constexpr double liftMinGain = .002;  // or where the lowest q rises by less
+constexpr int idleRounds = 2;         // in so many rounds
 constexpr double liftMaxDisp = 1e-3;  // relative to the shortest edge: a round's sweeps end there
-constexpr double liftWake = .015;     // unrest for a visit: only what happens near the worst counts
-constexpr double liftReach = .85;     // (η/η_w)^48 below it is nothing
+constexpr double liftWake = .05;      // unrest for a visit: only what happens near the worst counts
+constexpr double lastWake = .02;      // and in the last round, that of the mean
+constexpr double liftReach = .85;     // (η/η_w)^64 below it is nothing
 constexpr double liftRatio =
-    1.6;  // η/η_w at most: 1.6^48 = 6e9, and a Newton step lowers it e-fold
+    1.6;  // η/η_w at most: 1.6^64 = 1e13, and a Newton step lowers it e-fold
 
-/// q of the elements, the lowest, the mean, and what bounds the worst elements from above.
+/// q of the elements, the lowest, the mean, and what bounds the worst elements from above; of those
+/// that the sweeps have reached, since the others, as those at earlier surfaces, were lifted before.
 struct WorstElements {
   std::vector<double> q;
-  double lowest, mean, bound;
+  double lowest = 1, mean = 1, bound = 1;
 };
 
 WorstElements worstElements(const Smoother& S) {
-  WorstElements worst{qualitiesOf(S), 0, 0, 0};
-  std::vector<double> q = worst.q;
+  constexpr double notReached = 2;  // above every q
+  WorstElements worst{qualitiesOf(S)};
+  std::vector<double> q;
+  for (std::size_t E = 0; E < worst.q.size(); ++E) {
+    const std::array<int, 4>& z = S.M.tets[E];
+    if (S.reached[z[0]] || S.reached[z[1]] || S.reached[z[2]] || S.reached[z[3]])
+      q.push_back(worst.q[E]);
+    else
+      worst.q[E] = notReached;
+  }
+  if (q.empty()) return worst;
   const double count = static_cast<double>(q.size());
   const std::size_t wanted = std::max(worstCount, static_cast<std::size_t>(worstFraction * count));
   const auto bound = q.begin() + static_cast<std::ptrdiff_t>(std::min(q.size(), wanted)) - 1;
@@ -1561,32 +1584,35 @@ WorstElements worstElements(const Smoother& S) {
 }
 
 /// One round: sweeps on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes of the worst elements on.
-void liftRound(Smoother& S, const WorstElements& worst, double qw) {
+void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, double wake) {
   S.penalty = {1, qw, S.options.power};
   S.relaxation = S.options.relaxation;
-  S.wake = liftWake;
+  S.wake = wake;
   for (std::size_t E = 0; E < S.M.tets.size(); ++E)
     if (worst.q[E] <= worst.bound / liftReach)
       for (int n : S.M.tets[E]) wakeNode(S, n);
-  for (int k = 0; k < liftSweeps && sweepsLeft(S); ++k)
+  for (int k = 0; k < sweeps && sweepsLeft(S); ++k)
     if (sweepNodes(S) <= liftMaxDisp) return;
 }
 
-/// [§3.7.4 departure] Raises the worst elements of a valid, converged mesh: Σ η + (η/η_w)^power,
-/// with η_w the distortion that the worst 1 % exceed, anew in each round; the others keep Σ η. Ends
-/// where the lowest q rises no more. A last round with η_w that of the worst element lets all the
-/// others relax and wins the mean back.
+/// [§3.7.4 departure] Raises the worst elements of a valid, settled mesh: Σ η + (η/η_w)^power, with
+/// η_w the distortion that the worst .4 % exceed, anew in each round; the others keep Σ η. Ends where
+/// the lowest q rises no more. A last round with η_w that of the worst element lets all the others
+/// relax and wins the mean back.
 void liftWorst(Smoother& S) {
   WorstElements worst = worstElements(S);
   const double meanAtStart = worst.mean;
   if (worst.lowest > 1 - liftMinGain) return;
-  for (int round = 0; round < liftRounds && sweepsLeft(S); ++round) {
-    const double before = worst.lowest;
-    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest));
+  double highest = worst.lowest;
+  for (int round = 0, idle = 0; round < liftRounds && idle < idleRounds && sweepsLeft(S); ++round) {
+    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftSweeps, liftWake);
     worst = worstElements(S);
-    if (worst.mean < meanAtStart - liftMeanLoss || worst.lowest < before + liftMinGain) break;
+    if (worst.mean < meanAtStart - liftMeanLoss) break;
+    const bool rises = worst.lowest >= highest + liftMinGain;
+    idle = rises ? 0 : idle + 1;
+    if (rises) highest = worst.lowest;
   }
-  liftRound(S, worst, worst.lowest);
+  liftRound(S, worst, worst.lowest, lastSweeps, lastWake);
 }
 
 // ---- input -------------------------------------------------------------------------------------
@@ -1709,6 +1735,7 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   buildStars(S);
   buildSheets(S);
   S.awake = std::vector<std::atomic<unsigned char>>(M.x.size());
+  S.reached.assign(M.x.size(), options.active.empty());
   for (int n : options.active.empty() ? S.order : options.active) wakeNode(S, n);
 
   S.report.converged = untangleAndSmooth(S);
