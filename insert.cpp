@@ -4008,7 +4008,8 @@ bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
   return false;
 }
 
-/// Whether x is not farther than this from the tree's triangles: the first one found so near will do.
+/// Whether x is not farther than this from the tree's triangles: the first one found so near will
+/// do.
 bool isWithin(const TriangleTree& tree, Vec3 x, double distance) {
   double bound = distance;  // −1 ends the search
   visitNearest(tree, 0, boxDistance(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
@@ -6467,7 +6468,7 @@ constexpr double poorHausdorff = .3, poorWorth = .6;
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
   constexpr double badHausdorff = .45;  // [choice] of l_c: refused
-  constexpr double poorShift = 2;      // [choice] of h: warned of
+  constexpr double poorShift = 2;       // [choice] of h: warned of
   const std::string found = "the Hausdorff distance S_M - S is " + number(report.hausdorff) +
                             " near " + placeText(report.hausdorffPlace);
   if (report.hausdorff > badHausdorff * report.lc)
@@ -6823,7 +6824,8 @@ std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurf
   std::vector<InsertReport> reports;
   for (const Candidate& one : all)
     reports.push_back(labelled(one.label, [&] { return insertCandidate(result, one, options); }));
-  for (std::size_t i = 0; i + 1 < all.size(); ++i)  // later ones have refined and moved earlier ones
+  for (std::size_t i = 0; i + 1 < all.size();
+       ++i)  // later ones have refined and moved earlier ones
     labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i]); });
   M = std::move(result);
   return reports;

@@ -1781,8 +1781,7 @@ void labelPlain(const VtkFile& file, Mesh& M) {
   for (std::size_t c = 0; c < file.types.size(); ++c) {
     const double label = std::abs(found->second.values[c]);
     const bool good = label >= 1 && label < INT_MAX && label == std::floor(label);
-    if (good && isTriangle(file, c))
-      faces.push_back({cornersOf(file, c), static_cast<int>(label)});
+    if (good && isTriangle(file, c)) faces.push_back({cornersOf(file, c), static_cast<int>(label)});
   }
   std::swap(labelled.M, M);
   labelByTags(labelled, faces);
@@ -3695,8 +3694,8 @@ constexpr Option powerOption{
     "--power", "P", "exponent of the term that lifts the worst elements (default 64; 1: none)"};
 constexpr Option threadsOption{
     "--threads", "N", "threads that smooth (default 0: all cores); the result is the same for any"};
-constexpr Option maxTetsOption{
-    "--max-tets", "N", "refuse where more tetrahedra are predicted (default 20000000)"};
+constexpr Option maxTetsOption{"--max-tets", "N",
+                               "refuse where more tetrahedra are predicted (default 20000000)"};
 constexpr Option quietOption{"--quiet", "", "no progress on standard error"};
 
 const std::vector<Command>& commands() {

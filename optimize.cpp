@@ -1472,11 +1472,11 @@ void globalDescent(Smoother& S) {
 
 constexpr double acceleratedRelaxation = 1.5;  // of sweeps that are mixed
 constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is not visited again;
-/// [departure] where the worst elements are lifted afterwards, which smooths all others too: so much
-/// of it, and the sweeps end where the root mean square of the displacements is as small. To sweep
-/// on until no node moves took 2 to 10 times the visits for the same qualities in the end.
+/// [departure] where the worst elements are lifted afterwards, which smooths all others too: so
+/// much of it, and the sweeps end where the root mean square of the displacements is as small. To
+/// sweep on until no node moves took 2 to 10 times the visits for the same qualities in the end.
 constexpr double settledFraction = 2;
-constexpr int sweepsWithoutProgress = 3;  // that μ is given before the next
+constexpr int sweepsWithoutProgress = 3;       // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
 /// [choice] Where no descent may follow, a tangled mesh is given up after so many sweeps if more
@@ -1555,7 +1555,8 @@ constexpr double liftRatio =
     1.6;  // η/η_w at most: 1.6^64 = 1e13, and a Newton step lowers it e-fold
 
 /// q of the elements, the lowest, the mean, and what bounds the worst elements from above; of those
-/// that the sweeps have reached, since the others, as those at earlier surfaces, were lifted before.
+/// that the sweeps have reached, since the others, as those at earlier surfaces, were lifted
+/// before.
 struct WorstElements {
   std::vector<double> q;
   double lowest = 1, mean = 1, bound = 1;
@@ -1596,9 +1597,9 @@ void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, d
 }
 
 /// [§3.7.4 departure] Raises the worst elements of a valid, settled mesh: Σ η + (η/η_w)^power, with
-/// η_w the distortion that the worst .4 % exceed, anew in each round; the others keep Σ η. Ends where
-/// the lowest q rises no more. A last round with η_w that of the worst element lets all the others
-/// relax and wins the mean back.
+/// η_w the distortion that the worst .4 % exceed, anew in each round; the others keep Σ η. Ends
+/// where the lowest q rises no more. A last round with η_w that of the worst element lets all the
+/// others relax and wins the mean back.
 void liftWorst(Smoother& S) {
   WorstElements worst = worstElements(S);
   const double meanAtStart = worst.mean;

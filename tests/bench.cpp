@@ -1,8 +1,12 @@
 // SPDX-License-Identifier: MIT
 //
-// `make bench`: seconds of each stage of insertSurface, and tetrahedra per second, at four sizes.
+// `make bench`: seconds of each stage of insertSurface, tetrahedra per second, sweeps, the
+// process's peak memory per tetrahedron, and the exponent of the growth from one size to the next.
 // The surface is §4.1's sine, A = .1, finer than the mesh at each size.
+#include <sys/resource.h>
+
 #include <chrono>
+#include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <map>
@@ -13,13 +17,14 @@ namespace {
 
 using namespace meccano;
 
-/// cells and l_c: the elements at S have cubes of h = 1/16, 1/32, 1/64 (or 1/80), 1/160.
+/// cells and l_c: the elements at S have cubes of h = 1/16, 1/32, 1/80, 1/160, 1/320.
 struct Size {
   int cells;
   double lc;
 };
-constexpr Size sizes[] = {{2, .12}, {2, .06}, {5, .024}, {5, .012}};
-constexpr const char* stages[] = {"approximated",       "healed",    "extracted",
+constexpr Size sizes[] = {{2, .12}, {2, .06}, {5, .024}, {5, .012}, {5, .006}};
+constexpr int sizeCount = 5;
+constexpr const char* stages[] = {"approximated",  "healed",    "extracted",
                                   "surfaceHealed", "projected", "smoothed"};
 
 class Clock {
@@ -36,36 +41,54 @@ class Clock {
   std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
 };
 
-void benchOne(const Size& size, bool paper) {
+double peakBytes() {
+  rusage usage{};
+  getrusage(RUSAGE_SELF, &usage);
+  return 1024. * static_cast<double>(usage.ru_maxrss);
+}
+
+/// What one run takes.
+struct Run {
+  double tets = 0, seconds = 0, optimizing = 0;
+};
+
+Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
   const TriangleSurface S = samples::sine(.1, size.lc < .03 ? 160 : 64);
   Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {size.cells, size.cells, size.cells});
   InsertOptions options = paper ? InsertOptions::paper() : InsertOptions{};
   options.lc = size.lc;
+  options.optimize.threads = threads;
   std::map<std::string, double> seconds;
   Clock clock;
   options.onStage = [&](const char* stage, const Mesh&) { seconds[stage] += clock.lap(); };
+  Run run;
   try {
     const InsertReport report = insertSurface(M, S, options);
     const double tail = clock.lap();  // the checks and figures of the report
-    double before = 0;                // all stages but the optimization
-    std::printf("%8d %6g ", static_cast<int>(M.tets.size()), size.lc);
+    run = {static_cast<double>(M.tets.size()), tail, seconds["smoothed"]};
+    std::printf("%8d %6g %3d ", static_cast<int>(M.tets.size()), size.lc, threads);
     for (const char* stage : stages) {
-      std::printf("%10.3f", seconds[stage]);
-      if (stage != std::string("smoothed")) before += seconds[stage];
+      std::printf("%9.3f", seconds[stage]);
+      run.seconds += seconds[stage];
     }
-    const double count = static_cast<double>(M.tets.size());
-    std::printf("%8.3f %12.0f %12.0f %9d %7.3f %7.3f\n", tail, count / before,
-                count / (before + seconds["smoothed"] + tail), report.projected.inverted,
-                report.smoothed.min, report.smoothed.mean);
+    std::printf(" %9.0f %7.0f %6.0f %% %6d %6.0f %6.3f %6.3f", run.tets / run.seconds,
+                1e9 * run.seconds / run.tets, 100 * (1 - run.optimizing / run.seconds),
+                report.optimization.sweeps, peakBytes() / run.tets, report.smoothed.min,
+                report.smoothed.mean);
+    if (smaller.tets > 0)
+      std::printf(" %6.2f",
+                  std::log(run.seconds / smaller.seconds) / std::log(run.tets / smaller.tets));
+    std::printf("\n");
   } catch (const Error& error) {
     std::printf("l_c = %g: %s\n", size.lc, error.what());
   }
   std::fflush(stdout);
+  return run;
 }
 
 }  // namespace
 
-/// bench [--paper] [COUNT]: the first COUNT sizes, 4 without.
+/// bench [--paper] [COUNT]: the first COUNT sizes, 4 without; 5: 1.6 million tetrahedra.
 int main(int argc, char** argv) {
   bool paper = false;
   int count = 4;
@@ -75,11 +98,17 @@ int main(int argc, char** argv) {
     else
       count = std::atoi(argv[i]);
   std::printf(
-      "sine, A = .1%s; seconds of each stage, then tetrahedra per second without and with the "
-      "optimization\n",
+      "sine, A = .1%s; seconds of each stage (optimize: all ways), threads of the optimizer\n",
       paper ? ", paper()" : "");
   std::printf(
-      "    tets    l_c     refine      heal   extract s.healing   project  optimize  report     "
-      "t/s before      t/s all  inverted     min    mean\n");
-  for (int i = 0; i < count && i < 4; ++i) benchOne(sizes[i], paper);
+      "    tets    l_c thr   refine     heal  extract s.healing project optimize    tets/s ns/tet  "
+      "not opt. sweeps B/tet    min   mean growth\n");
+  Run last;
+  for (int i = 0; i < count && i < sizeCount; ++i) {
+    const Run one = benchOne(sizes[i], paper, 1, last);
+    const Run two = benchOne(sizes[i], paper, 2, {});
+    std::printf("%18s optimizer on 2 threads: %.2f times as fast\n", "",
+                one.optimizing / two.optimizing);
+    last = one;
+  }
 }

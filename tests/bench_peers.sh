@@ -53,16 +53,14 @@ GEO
 # CPU seconds of a command: times prints those of the children last, as 0m1.234s 0m0.5s
 cpu() {
   "$@" > log.txt 2>&1 || { cat log.txt; exit 1; }
-  times | tail -n 1 | awk '{ for (i = 1; i <= 2; ++i) { split($i, t, "m"); s += 60*t[1] + t[2] } print s }'
+  times > times.txt
+  tail -n 1 times.txt | awk '{ for (i = 1; i <= 2; ++i) { split($i, t, "m"); s += 60*t[1] + t[2] } print s }'
 }
 median() { sort -n | sed -n 3p; }
-# Tetrahedra, and lowest and mean q against the regular tetrahedron.
+# Tetrahedra, and lowest and mean q: against the regular tetrahedron, for .msh keeps no other.
 figures() {
-  "$meccano" stats "$1" | awk '/^tetrahedra/ { n = $2 }
-    /regular/ { match($0, /min [0-9.]+/); lo = substr($0, RSTART + 4, RLENGTH - 4)
-                match($0, /mean [0-9.]+/); me = substr($0, RSTART + 5, RLENGTH - 5) }
-    /^min/ && lo == "" { l = $2 } /^mean/ && me == "" { m = $2 }
-    END { print n, lo == "" ? l : lo, me == "" ? m : me }'
+  "$meccano" stats "$1" | awk '/^tetrahedra/ { n = $2 } /^min/ { lo = $2 } /^mean/ { me = $2 }
+    END { print n, lo, me }'
 }
 echo '  tets  CPU s   us/tet  min/mean against the regular tetrahedron'
 for pair in .02:.06 .01:.03; do
@@ -70,10 +68,10 @@ for pair in .02:.06 .01:.03; do
   : > theirs.txt; : > ours.txt
   for run in 1 2 3 4 5; do
     (cpu gmsh -3 sine2.geo -nt 1 -setnumber h "0$h" -o gmsh.msh) >> theirs.txt
-    (cpu "$meccano" insert cube.vtk sine2.stl --lc "$lc" --threads 1 -o ours.vtk) >> ours.txt
+    (cpu "$meccano" insert cube.vtk sine2.stl --lc "$lc" --threads 1 -o ours.msh) >> ours.txt
   done
   { echo "$(median < theirs.txt) $(figures gmsh.msh) gmsh h=$h"
-    echo "$(median < ours.txt) $(figures ours.vtk) meccano l_c=$lc"; } |
+    echo "$(median < ours.txt) $(figures ours.msh) meccano l_c=$lc"; } |
     awk '{ us = 1e6*$1/$2; printf "%7d %6.2f %7.1f  %s / %s  %s %s", $2, $1, us, $3, $4, $5, $6
            if (NR == 2) printf "  ratio per tetrahedron %.2f", us/first; else first = us; print "" }'
 done
