@@ -22,6 +22,7 @@
 #include <numeric>
 #include <system_error>
 #include <thread>
+#include <tuple>
 
 #include "meccano.hpp"
 
@@ -822,28 +823,102 @@ void buildStars(Smoother& S) {
   S.starStart.push_back(static_cast<int>(S.star.size()));
 }
 
+struct SheetFace {
+  int label;
+  std::array<int, 3> v;
+  double area;  // twice, in 𝓤; 0: a parameter is not known
+  bool operator<(const SheetFace& other) const { return key() < other.key(); }
+  std::array<int, 4> key() const {
+    std::array<int, 3> s = v;
+    std::sort(s.begin(), s.end());
+    return {label, s[0], s[1], s[2]};
+  }
+};
+
+/// The labelled faces, each once.
+std::vector<SheetFace> sheetFaces(const Mesh& M) {
+  std::vector<SheetFace> faces;
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int k = 0; k < 4; ++k) {
+      SheetFace f{M.faceLabel[E][k], {}, 0};
+      if (f.label == 0) continue;
+      Vec2 u[3];
+      bool known = true;
+      for (int i = 0; i < 3; ++i) {
+        f.v[i] = M.tets[E][opposite[k][i]];
+        known = known && parameterOn(M, f.v[i], f.label, u[i]);
+      }
+      if (known) f.area = cross(u[1] - u[0], u[2] - u[0]);
+      faces.push_back(f);
+    }
+  std::sort(faces.begin(), faces.end());
+  const auto same = [](const SheetFace& a, const SheetFace& b) { return a.key() == b.key(); };
+  faces.erase(std::unique(faces.begin(), faces.end(), same), faces.end());
+  return faces;
+}
+
+void turn(SheetFace& f) {
+  std::swap(f.v[1], f.v[2]);
+  f.area = -f.area;
+}
+
+/// Orients each sheet's faces alike, and so that most of its area in 𝓤 is counter-clockwise: a
+/// folded face is then known as one.
+void orientSheets(std::vector<SheetFace>& faces) {
+  struct Edge {
+    int label, lo, hi;
+    std::size_t face;
+    bool forward;
+    bool operator<(const Edge& e) const {
+      return std::tie(label, lo, hi, face) < std::tie(e.label, e.lo, e.hi, e.face);
+    }
+  };
+  std::vector<Edge> edges;
+  for (std::size_t f = 0; f < faces.size(); ++f)
+    for (int i = 0; i < 3; ++i) {
+      const int a = faces[f].v[i], b = faces[f].v[(i + 1) % 3];
+      edges.push_back({faces[f].label, std::min(a, b), std::max(a, b), f, a < b});
+    }
+  std::sort(edges.begin(), edges.end());
+  std::vector<std::vector<std::pair<std::size_t, bool>>> beside(faces.size());  // face, turned
+  for (std::size_t e = 0; e + 1 < edges.size(); ++e) {
+    const Edge &a = edges[e], &b = edges[e + 1];
+    if (std::tie(a.label, a.lo, a.hi) != std::tie(b.label, b.lo, b.hi)) continue;
+    beside[a.face].push_back({b.face, a.forward == b.forward});
+    beside[b.face].push_back({a.face, a.forward == b.forward});
+  }
+  std::vector<char> turned(faces.size(), 0), seen(faces.size(), 0);
+  for (std::size_t start = 0; start < faces.size(); ++start) {
+    if (seen[start]) continue;
+    std::vector<std::size_t> sheet{start};
+    seen[start] = 1;
+    double area = 0;
+    for (std::size_t i = 0; i < sheet.size(); ++i) {
+      const std::size_t f = sheet[i];
+      area += turned[f] ? -faces[f].area : faces[f].area;
+      for (const auto& [next, isTurned] : beside[f]) {
+        if (seen[next]) continue;
+        seen[next] = 1;
+        turned[next] = turned[f] != isTurned;
+        sheet.push_back(next);
+      }
+    }
+    for (std::size_t f : sheet)
+      if (turned[f] != (area < 0)) turn(faces[f]);
+  }
+}
+
 /// The labelled faces at each sliding node, as triangles of 𝓤.
 void buildSheets(Smoother& S) {
   const Mesh& M = S.M;
   if (M.faceLabel.empty() || M.dimension.empty()) return;
+  std::vector<SheetFace> faces = sheetFaces(M);
+  orientSheets(faces);
   std::vector<std::pair<int, SheetTriangle>> entries;
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
-    for (int k = 0; k < 4; ++k) {
-      const int label = M.faceLabel[E][k];
-      if (label == 0) continue;
-      int v[3];
-      Vec2 u[3];
-      bool known = true;
-      for (int i = 0; i < 3; ++i) {
-        v[i] = M.tets[E][opposite[k][i]];
-        known = known && parameterOn(M, v[i], label, u[i]);
-      }
-      const double area = known ? cross(u[1] - u[0], u[2] - u[0]) : 0;
-      if (area < 0) std::swap(v[1], v[2]);
-      for (int i = 0; i < 3 && area != 0; ++i)
-        if (S.freedom[v[i]] == 1 || S.freedom[v[i]] == 2)
-          entries.push_back({v[i], {v[(i + 1) % 3], v[(i + 2) % 3], label}});
-    }
+  for (const SheetFace& f : faces)
+    for (int i = 0; i < 3 && f.area != 0; ++i)
+      if (S.freedom[f.v[i]] == 1 || S.freedom[f.v[i]] == 2)
+        entries.push_back({f.v[i], {f.v[(i + 1) % 3], f.v[(i + 2) % 3], f.label}});
   S.sheetStart.assign(M.x.size() + 1, 0);
   for (const auto& entry : entries) ++S.sheetStart[entry.first + 1];
   for (std::size_t n = 0; n < M.x.size(); ++n) S.sheetStart[n + 1] += S.sheetStart[n];
@@ -963,18 +1038,22 @@ double visitInner(Smoother& S, int n, const Visit& visit, const Edges& edges) {
 }
 
 /// [departure] Whether the surface triangles at n stay counter-clockwise in 𝓤 with n at this
-/// parameter. While elements are inverted f alone lets a node slide past its neighbours, or a rim
-/// node round a corner, from where no descent brings it back.
+/// parameter, and folded ones come nearer to it. While elements are inverted f alone lets a node
+/// slide past its neighbours, or a rim node round a corner, from where no descent brings it back.
 bool staysUnfolded(Smoother& S, int n, Vec2 parameter) {
   if (S.sheetStart.empty()) return true;
   const Vec2 before = S.M.parameter[n];
-  S.M.parameter[n] = parameter;
+  const auto twiceArea = [&](const SheetTriangle& t, Vec2 at) {
+    Vec2 u, a, b;
+    S.M.parameter[n] = at;
+    const bool known = parameterOn(S.M, n, t.label, u) && parameterOn(S.M, t.a, t.label, a) &&
+                       parameterOn(S.M, t.b, t.label, b);
+    return known ? cross(a - u, b - u) : -unbounded;
+  };
   bool unfolded = true;
-  Vec2 u, a, b;
   for (int k = S.sheetStart[n]; k < S.sheetStart[n + 1] && unfolded; ++k) {
-    const SheetTriangle& t = S.sheet[k];
-    unfolded = parameterOn(S.M, n, t.label, u) && parameterOn(S.M, t.a, t.label, a) &&
-               parameterOn(S.M, t.b, t.label, b) && cross(a - u, b - u) > 0;
+    const double area = twiceArea(S.sheet[k], parameter);
+    unfolded = area > 0 || area > twiceArea(S.sheet[k], before);
   }
   S.M.parameter[n] = before;
   return unfolded;
