@@ -6378,30 +6378,55 @@ void releaseCorner(Mesh& M, int n, int k) {
     }
 }
 
-/// §3.7, and [departure] where a few elements stay inverted: their corners are released, they are
-/// bisected for more freedom, as long as their number falls. No global descent here: other ways of
-/// inserting S are cheaper.
-void optimizeAround(Bisection& B, const Insertion& I, InsertReport& report) {
-  constexpr int maxRounds = 4, fewInverted = 60;
+/// Releases the corners of these elements and bisects them: more freedom. Returns the nodes around.
+std::vector<int> loosen(Mesh& M, const std::vector<int>& elements, int k) {
+  std::vector<int> nodes;
+  const std::size_t before = M.x.size();
+  Bisection B(M);
+  for (int E : elements) {
+    for (int n : M.tets[E]) {
+      releaseCorner(M, n, k);
+      nodes.push_back(n);
+    }
+    B.bisect(E);
+  }
+  surfaceHealing(B, k);
+  for (std::size_t n = before; n < M.x.size(); ++n) nodes.push_back(static_cast<int>(n));
+  return nodes;
+}
+
+/// §3.7, and [departure] where a few elements stay inverted, or poor as where S_M bridges a slit:
+/// these are loosened, as long as there are fewer inverted ones, or the lowest q rises. No global
+/// descent here: other ways of inserting S are cheaper.
+void optimizeAround(Mesh& M, const Insertion& I, InsertReport& report) {
+  constexpr int maxRounds = 4;
+  constexpr std::size_t few = 60;
+  constexpr double poorQuality = .45;         // below it the worst are loosened: those below
+  constexpr double narrow = 1.1, wide = 1.3;  // of the lowest q, then below more of it
   OptimizeOptions optimize = I.options.optimize;
   optimize.globalDescent = false;
-  optimize.active = nodesNear(B.M, I.k);
-  report.optimization = optimizeMesh(B.M, optimize);
+  optimize.active = nodesNear(M, I.k);
+  OptimizeReport& best = report.optimization;
+  best = optimizeMesh(M, optimize);
+  double factor = narrow;
   for (int round = 0; round < maxRounds; ++round) {
-    const int inverted = report.optimization.inverted;
-    if (inverted == 0 || inverted > fewInverted) return;
-    const std::vector<double> q = qualities(B.M);
+    const bool valid = best.inverted == 0;
+    if (valid && (optimize.power == 1 || best.minQ >= poorQuality)) return;
+    const std::vector<double> q = qualities(M);
+    std::vector<int> bad;
     for (std::size_t E = 0; E < q.size(); ++E)
-      if (q[E] <= 0) {
-        for (int n : B.M.tets[E]) releaseCorner(B.M, n, I.k);
-        B.bisect(static_cast<int>(E));
-      }
-    surfaceHealing(B, I.k);
-    optimize.active.clear();
-    const int sweeps = report.optimization.sweeps;
-    report.optimization = optimizeMesh(B.M, optimize);
-    report.optimization.sweeps += sweeps;
-    if (report.optimization.inverted >= inverted) return;
+      if (q[E] <= factor * best.minQ) bad.push_back(static_cast<int>(E));
+    if (bad.size() > few) return;
+    Mesh trial = M;
+    optimize.active = loosen(trial, bad, I.k);
+    if (!valid) optimize.active.clear();
+    OptimizeReport after = optimizeMesh(trial, optimize);
+    after.sweeps += best.sweeps;
+    const bool better = valid ? after.inverted == 0 && after.minQ > best.minQ
+                              : after.inverted < best.inverted;
+    if (!better && (!valid || factor == wide)) return;
+    if (!better) factor = wide;
+    if (better) M = std::move(trial), best = after;
   }
 }
 
@@ -6423,7 +6448,7 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   report.projected = qualityStatistics(M);
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
-  optimizeAround(B, I, report);
+  optimizeAround(M, I, report);
   report.smoothed = qualityStatistics(M);
   I.progress("3.7 optimization: " + std::to_string(report.optimization.sweeps) + " sweeps, " +
              std::to_string(report.smoothed.inverted) + " inverted, min " +

@@ -1626,6 +1626,8 @@ constexpr double liftMeanLoss =
     .015;  // of mean q: the rounds end there (the last one wins most back),
 constexpr double liftMinGain = .002;  // or where the lowest q rises by less
 constexpr int idleRounds = 2;         // in so many rounds
+constexpr double lowQuality = .45;    // below it the lift has patience:
+constexpr int patientRounds = 60, patientIdleRounds = 8;
 constexpr double liftMaxDisp = 1e-3;  // relative to the shortest edge: a round's sweeps end there
 constexpr double liftWake = .05;      // unrest for a visit: only what happens near the worst counts
 constexpr double lastWake = .02;      // and in the last round, that of the mean
@@ -1684,7 +1686,10 @@ void liftWorst(Smoother& S) {
   const double meanAtStart = worst.mean;
   if (worst.lowest > 1 - liftMinGain) return;
   double highest = worst.lowest;
-  for (int round = 0, idle = 0; round < liftRounds && idle < idleRounds && sweepsLeft(S); ++round) {
+  for (int round = 0, idle = 0; sweepsLeft(S); ++round) {
+    const bool low = worst.lowest < lowQuality;
+    if (round >= (low ? patientRounds : liftRounds)) break;
+    if (idle >= (low ? patientIdleRounds : idleRounds)) break;
     liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftSweeps, liftWake);
     worst = worstElements(S);
     if (worst.mean < meanAtStart - liftMeanLoss) break;
