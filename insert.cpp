@@ -2713,6 +2713,7 @@ bool isPlanar(const Parametrization& P) {
 struct CurvedBoundary {
   std::vector<char> curved;  // [patches]
   TriangleTree tree;
+  bool isFixed = false;  // nodes cannot slide
 };
 
 CurvedBoundary curvedBoundary(const Mesh& M) {
@@ -2786,7 +2787,9 @@ void sampleFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& O
 FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& Omega,
                          double enough, double largest) {
   constexpr int steps = 5, finer = 11, most = 64;  // [choice] 18 points of each face, 93, 2142
+  constexpr int middles = 2;  // [choice] of edges, too, where Π is fixed and bends most there
   FaceDistance d;
+  if (Omega.isFixed) sampleFace(M, face, Omega, enough, middles, d);
   sampleFace(M, face, Omega, enough, steps, d);
   const double so = std::max(d.toSolid, d.toFace);
   if (enough > 0 && so > enough) return d;
@@ -2994,13 +2997,7 @@ struct Mesher {
   }
 };
 
-/// [choice] Of ε is held where it is sampled: the rest is for between. Faces that cannot slide
-/// become large and thin beside small ones, and bend more between.
-constexpr double sampledEps = .97, sampledEpsFixed = .94;
-
-double heldEps(const MesherOptions& options) {
-  return (options.fixedBoundary ? sampledEpsFixed : sampledEps) * options.eps;
-}
+constexpr double sampledEps = .97;  // [choice] of ε is held where it is sampled: 3 % for between
 
 std::string sizeText(const Mesh& M) { return std::to_string(M.tets.size()) + " tetrahedra"; }
 
@@ -3184,7 +3181,7 @@ int approachGradually(Mesher& W, const Mesh& initial) {
   int left = 0;
   W.M = initial;
   for (double factor : approach) {
-    const double eps = factor * heldEps(W.options);
+    const double eps = factor * sampledEps * W.options.eps;
     refineToDistance(W, eps);
     const Mesh refined = W.M;
     left = untangleFixed(W, false);
@@ -3274,7 +3271,7 @@ struct BestMesh {
 
 /// qualityOptimization with ∂Ω prepared; `initial` is the mesh before its refinement.
 void optimizeQuality(Mesher& W, const Mesh& initial) {
-  const double eps = heldEps(W.options);
+  const double eps = sampledEps * W.options.eps;
   const bool slid = untangleWithin(W, initial, eps);
   W.report.untangled = qualityStatistics(W.M);
   W.stage("untangled");
@@ -3330,6 +3327,7 @@ void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& re
   checkOptions(options.optimize, M.x.size());
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
+  W.Omega.isFixed = options.fixedBoundary;
   optimizeQuality(W, M);
   M = std::move(work);
 }
@@ -3344,8 +3342,9 @@ MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
   report.eps = options.eps;
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
+  W.Omega.isFixed = options.fixedBoundary;
   W.stage("initial");
-  report.passes = refineToDistance(W, heldEps(options));
+  report.passes = refineToDistance(W, sampledEps * options.eps);
   report.refined = qualityStatistics(work);
   W.stage("refined");
   W.progress("refined: " + sizeText(work) + " after " + std::to_string(report.passes) +
