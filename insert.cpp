@@ -2713,6 +2713,7 @@ bool isPlanar(const Parametrization& P) {
 struct CurvedBoundary {
   std::vector<char> curved;  // [patches]
   TriangleTree tree;
+  bool isFixed = false;  // nodes cannot slide
 };
 
 CurvedBoundary curvedBoundary(const Mesh& M) {
@@ -2786,7 +2787,9 @@ void sampleFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& O
 FaceDistance sampledFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& Omega,
                          double enough, double largest) {
   constexpr int steps = 5, finer = 11, most = 64;  // [choice] 18 points of each face, 93, 2142
+  constexpr int middles = 2;  // [choice] of edges, too, where Π is fixed and bends most there
   FaceDistance d;
+  if (Omega.isFixed) sampleFace(M, face, Omega, enough, middles, d);
   sampleFace(M, face, Omega, enough, steps, d);
   const double so = std::max(d.toSolid, d.toFace);
   if (enough > 0 && so > enough) return d;
@@ -3324,6 +3327,7 @@ void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& re
   checkOptions(options.optimize, M.x.size());
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
+  W.Omega.isFixed = options.fixedBoundary;
   optimizeQuality(W, M);
   M = std::move(work);
 }
@@ -3338,6 +3342,7 @@ MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
   report.eps = options.eps;
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
+  W.Omega.isFixed = options.fixedBoundary;
   W.stage("initial");
   report.passes = refineToDistance(W, sampledEps * options.eps);
   report.refined = qualityStatistics(work);

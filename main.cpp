@@ -3286,6 +3286,10 @@ MesherOptions mesherOptions(const Arguments& a, Progress& progress) {
   return o;
 }
 
+void checkEps(const Arguments& a) {
+  if (!(a.number("--eps", 0.) > 0)) fail("--eps " + a.options.at("--eps")[0] + " must be above 0");
+}
+
 /// Writes a mesh of Algorithm 1 and prints its report.
 void finishMesher(const std::string& path, const Mesh& M, const MesherReport& r, Progress& progress,
                   const Streams& io) {
@@ -3301,7 +3305,7 @@ void runTerrain(const Arguments& a, const Streams& io) {
   if (!a.has("--top")) throw UsageError("the height of the top is missing: --top Z");
   Progress progress(io, a.has("--quiet"));
   MesherOptions options = mesherOptions(a, progress);
-  if (a.has("--eps") && !(options.eps > 0)) throw UsageError("--eps must be above 0");
+  if (a.has("--eps")) checkEps(a);
   checkWritable(path);
   Terrain T = readTerrain(a.operands[0]);
   T.top = a.number("--top", 0.);
@@ -3326,11 +3330,11 @@ void runSolid(const Arguments& a, const Streams& io) {
   if (!a.has("--eps")) throw UsageError("the precision is missing: --eps E");
   Progress progress(io, a.has("--quiet"));
   MesherOptions options = mesherOptions(a, progress);
-  if (!(options.eps > 0)) throw UsageError("--eps must be above 0");
+  checkEps(a);
   checkWritable(path);
   std::vector<std::string> warnings;
   const std::vector<TriangleSurface> all = readSurfaces(a.operands[0], warnings);
-  for (const std::string& warning : warnings) progress.line("warning: " + warning);
+  for (const std::string& warning : warnings) progress.warning(warning);
   if (all.size() != 1)
     fail(a.operands[0] + ": holds " + std::to_string(all.size()) +
          " surfaces, and the boundary of one solid is needed; keep one");

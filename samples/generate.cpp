@@ -10,6 +10,7 @@
 
 #define MECCANO_NO_MAIN
 #include "../main.cpp"
+#include "../tests/solids.hpp"
 #include "surfaces.hpp"
 
 namespace {
@@ -27,7 +28,7 @@ constexpr const char* help =
     "           the terrain, its heights averaged SMOOTH times over 3 x 3, lifted by HEIGHT, up\n"
     "           to MARGIN before its sides\n"
     "\n"
-    "NAME [ARGS] (default)    all but fault in the unit cube, formulas in surfaces.hpp\n"
+    "NAME [ARGS] (default)    all but fault, blob in the unit cube, formulas in surfaces.hpp\n"
     "  sine A (.1) N (64)     z = .5 + A sin(2 pi x), N x N x 2 triangles\n"
     "  sine2 A (.1)           z = .5 + A sin(2 pi x) sin(2 pi y)\n"
     "  plane AX (10) AY (0)   a square turned about x, then y; degrees\n"
@@ -40,7 +41,8 @@ constexpr const char* help =
     "  raggedRim\n"
     "  ridge KIND (0)         0 mild, 1 knife\n"
     "  patch SEED (1)         a random patch of make stress\n"
-    "  fault K (1)            west, east, ring, lobe of the sample, in a box of 4 x 3 x 2\n";
+    "  fault K (1)            west, east, ring, lobe of the sample, in a box of 4 x 3 x 2\n"
+    "  blob N (40)            a closed surface, a sphere with bumps and dents; not in the cube\n";
 
 /// The shortest text that reads back as the same double.
 std::string shortest(double value) {
@@ -165,6 +167,7 @@ TriangleSurface surfaceByName(const std::string& name, const std::vector<std::st
     return samples::ridge(arg(0, 0) > 0 ? samples::Ridge::knife : samples::Ridge::mild);
   if (name == "patch") return samples::randomPatch(static_cast<std::uint64_t>(arg(0, 1)));
   if (name == "fault") return samples::faults().at(static_cast<std::size_t>(arg(0, 1) - 1));
+  if (name == "blob") return solids::blob(static_cast<int>(arg(0, 40)));
   throw meccano::InputError("generate: no surface '" + name + "'; see --help");
 }
 

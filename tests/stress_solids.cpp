@@ -65,6 +65,12 @@ void addGenerated(std::vector<Row>& all) {
                  placed(ell(), roughly), {.5, .85}});
   all.push_back(
       {"torus", .005, torus(1, .4, fine), "", placed(ring(), aroundTorus), {.55, .85}});
+  for (const char* name : {"sphere", "torus"})
+    for (std::size_t k = 0, n = all.size(); k < n; ++k)
+      if (all[k].name == name) {
+        all.push_back(all[k]);
+        all.back().name += " fixed", all.back().fixedBoundary = true, all.back().figures = {};
+      }
 }
 
 void addSolids(std::vector<Row>& all) {

@@ -207,6 +207,26 @@ TEST_SUITE("2") {
     CHECK(shapes::sameMesh(M, before));
   }
 
+  TEST_CASE("qualityOptimization: --max-tets holds in the rounds of sliding, with the message") {
+    const TriangleSurface S = solids::ellipsoid(8, {1, 1.6, 2.4});
+    MesherOptions options = withEps(.03);
+    int refined = 0, largest = 0;
+    options.onStage = [&](const char* name, const Mesh& M) {
+      if (std::string(name) == "refined") refined = static_cast<int>(M.tets.size());
+      largest = std::max(largest, static_cast<int>(M.tets.size()));
+    };
+    Mesh M = shapes::kuhnCube();
+    meccanoMesher(M, S, options);
+    REQUIRE(largest > refined);
+    const Mesh before = M;
+    options.maxTets = refined + 1;
+    largest = 0;
+    const std::string text = messageOf([&] { meccanoMesher(M, S, options); });
+    CHECK(has(text, "above the limit of " + std::to_string(options.maxTets)));
+    CHECK(largest == refined);
+    CHECK(shapes::sameMesh(M, before));
+  }
+
   TEST_CASE("heightAt, terrainCells, terrainEps: bilinear, near-cubic, 1/500 of the diagonal") {
     Terrain T = hill();
     CHECK(heightAt(T, 300 + 50 * 3, -200 + 50 * 4) == doctest::Approx(T.z[4 * 24 + 3]));

@@ -1226,7 +1226,7 @@ TEST_SUITE("command line") {
     const std::string in = folder.file("d.asc", dem), out = folder / "d.vtk";
     CHECK(call({"terrain", in, "-o", out}).status == 2);
     CHECK(call({"terrain", in, "-o", out, "--top", "10"}).status == 1);
-    CHECK(call({"terrain", in, "-o", out, "--top", "60", "--eps", "0"}).status == 2);
+    CHECK(call({"terrain", in, "-o", out, "--top", "60", "--eps", "0"}).status == 1);
     CHECK(!fs::exists(out));
     const Outcome o = call({"terrain", in, "-o", out, "--top", "60", "--cells", "4", "4", "3"});
     REQUIRE_MESSAGE(o.status == 0, o.err);
@@ -1254,5 +1254,44 @@ TEST_SUITE("command line") {
     CHECK(has(error("corner 0 0 0 1 2\n"), "a corner is `corner i j k  x y z`"));
     CHECK(has(error("corner 0 0 0 1 2 nan\n"), "'nan' is no coordinate"));
     CHECK(has(error("kube 0 0 0\n"), "'kube' is no line of a polycube"));
+  }
+
+  TEST_CASE("solid: the command refuses what is no solid, no eps, no fitting polycube") {
+    Folder folder;
+    std::string cube;
+    for (const char* p : {"0 0 0", "1 0 0", "0 1 0", "1 1 0", "0 0 1", "1 0 1", "0 1 1", "1 1 1"})
+      cube += format("v %s\n", p);
+    const std::string open = "f 1 3 4 2\nf 5 6 8 7\nf 1 2 6 5\nf 3 7 8 4\nf 1 5 7 3\n";
+    const std::string in = folder.file("cube.obj", cube + open + "f 2 4 8 6\n");
+    const std::string out = folder / "cube.vtk";
+    std::string corners;
+    for (int n = 0; n < 8; ++n)
+      corners += format("corner %d %d %d  %d %d %d\n", n % 2, n / 2 % 2, n / 4, n % 2, n / 2 % 2,
+                        n / 4);
+    const auto refusal = [&](const std::string& file, const char* eps, const std::string& polycube) {
+      std::vector<std::string> words{"solid", file, "--eps", eps, "-o", out, "--max-tets", "9000"};
+      if (!polycube.empty())
+        words.insert(words.end(), {"--polycube", folder.file("p.txt", polycube)});
+      const Outcome o = call(words);
+      CHECK(o.status == 1);
+      CHECK(!fs::exists(out));
+      return o.err;
+    };
+    const std::string one = "cube 0 0 0\n";
+    CHECK(has(refusal(folder.file("open.obj", cube + open), ".1", ""), "the surface is open"));
+    // the zero-area triangle that closes it along an edge is dropped, and that is said
+    const std::string flat = "v .5 0 0\nf 1 2 9\nf 1 9 6 5\nf 9 2 6\n";
+    const std::string needle = refusal(
+        folder.file("flat.obj", cube + flat + "f 1 3 4 2\nf 5 6 8 7\nf 3 7 8 4\nf 1 5 7 3\n"
+                                              "f 2 4 8 6\n"),
+        ".1", "");
+    CHECK(has(needle, "1 zero-area triangle"));
+    CHECK(has(needle, "the surface is open"));
+    for (const char* eps : {"0", "-1"}) CHECK(has(refusal(in, eps, ""), "must be above 0"));
+    CHECK(has(refusal(in, ".1", one + "cube 1 1 0\n"), "no manifold at the edge"));
+    CHECK(has(refusal(in, ".1", one + corners + "corner 1 1 1  1 1 1\n"), "placed twice"));
+    CHECK(has(refusal(in, ".1", one + "corner 0 0 0  9 9 9\n"), "of its diagonal"));
+    CHECK(call({"solid", in, "-o", out}).status == 2);
+    CHECK(folder.files() == 4);
   }
 }
