@@ -3164,6 +3164,7 @@ OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide,
     const OptimizeReport report = optimizeMesh(W.M, optimize);
     if (report.minQ > stuckQuality && report.minQ > keptPart * before) return report;
   }
+  optimize.active.clear();  // the lift looks at all elements
   optimize.power = W.options.optimize.power;
   return optimizeMesh(W.M, optimize);
 }
