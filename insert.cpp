@@ -4299,6 +4299,11 @@ double predictedTets(double area, double h) {
   return tetsPerSquare * area / (h * h);
 }
 
+double extentOf(const SurfaceDistance& S) {
+  const TriangleTree::Box& box = S.tree.nodes[0].box;
+  return norm(box.hi - box.lo);
+}
+
 }  // namespace
 
 SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
@@ -4307,8 +4312,7 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
   constexpr double lowest = 1. / 8, mostTets = 1e6;
   constexpr double perBoundary = 2.5, perSurface = 1.75, perRim = 1.5, perSheet = 2;  // of h
   const double root3 = std::sqrt(3.);
-  const TriangleTree::Box& box = S.tree.nodes[0].box;
-  const double extent = norm(box.hi - box.lo), largest = extent / perExtent;
+  const double extent = extentOf(S), largest = extent / perExtent;
   const double finest = root3 * std::sqrt(predictedTets(areaOf(S.S), 1) / mostTets);
   SizeChoice size{largest, "the extent of S", extent, S.S.points[S.rim[0]], largest, 0};
   size.finest = std::min(largest, std::max(lowest * largest, finest));
@@ -6436,6 +6440,12 @@ void optimizeAround(Mesh& M, const Insertion& I, InsertReport& report) {
   }
 }
 
+/// A corner of the first inverted element.
+Vec3 firstInverted(const Mesh& M) {
+  const std::vector<double> q = qualities(M);
+  return M.x[M.tets[std::min_element(q.begin(), q.end()) - q.begin()][0]];
+}
+
 /// §3.4's labels, 3.5, 3.6 and 3.7 on a copy of the refined mesh.
 void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   Bisection B(M);
@@ -6462,7 +6472,7 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   if (report.smoothed.inverted > 0)
     throw MethodError("insertSurface (§3.7): " + std::to_string(report.smoothed.inverted) +
                       " elements stay inverted, of " + std::to_string(report.projected.inverted) +
-                      " after the projection");
+                      " after the projection, the first near " + placeText(firstInverted(M)));
 }
 
 /// The measures of S_M that the report promises.
@@ -6660,7 +6670,9 @@ std::string advice(const Insertion& I, const Mesh& M, double largest, double lc)
   const std::vector<Crossing> crossings = selfCrossings(S.S);
   if (!crossings.empty()) return describe(crossings) + ": mend S there";
   const SizeChoice size = chooseSize(M, S);
-  return describe(size) + ": lower l_c to " + number(std::min(size.resolving, .5 * lc));
+  const bool isExtent = size.measure == extentOf(S);
+  return (!isExtent ? describe(size) : "S bends or narrows there within the cubes") +
+         ": lower l_c to " + number(std::min(size.resolving, .5 * lc));
 }
 
 /// The search for l_c: the first of the sizes with a valid mesh, within the tolerance where one is
