@@ -6410,6 +6410,7 @@ std::vector<int> loosen(Mesh& M, const std::vector<int>& elements, int k) {
 /// descent here: other ways of inserting S are cheaper.
 void optimizeAround(Mesh& M, const Insertion& I, InsertReport& report) {
   constexpr int maxRounds = 4;
+  constexpr int patientSweeps = 150;  // while tangled, of a loosened mesh: few elements are left
   constexpr std::size_t few = 60;
   constexpr double poorQuality = .45;         // below it the worst are loosened: those below
   constexpr double narrow = 1.1, wide = 1.3;  // of the lowest q, then below more of it
@@ -6429,7 +6430,7 @@ void optimizeAround(Mesh& M, const Insertion& I, InsertReport& report) {
     if (bad.size() > few) return;
     Mesh trial = M;
     optimize.active = loosen(trial, bad, I.k);
-    if (!valid) optimize.active.clear();
+    if (!valid) optimize.active.clear(), optimize.maxTangledSweeps = patientSweeps;
     OptimizeReport after = optimizeMesh(trial, optimize);
     after.sweeps += best.sweeps;
     const bool better = valid ? after.inverted == 0 && after.minQ > best.minQ
