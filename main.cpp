@@ -3753,8 +3753,7 @@ const std::vector<Command>& commands() {
        runSolid},
       {"insert",
        "MESH.vtk SURFACE [SURFACE ...]",
-       "Inserts triangulated surfaces into a mesh that meccano wrote, one after the other, and "
-       "prints\n"
+       "Inserts triangulated surfaces into a mesh that meccano wrote, the largest first, and prints\n"
        "Table I: the quality of the original, refined, projected and smoothed mesh, against its\n"
        "computational elements. A surface of several components becomes several.\n"
        "Surfaces are read from OBJ, OFF, STL, PLY and GOCAD TSurf files, several of a file too.",
