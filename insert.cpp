@@ -2853,7 +2853,8 @@ void measurePatch(const Mesh& M, const std::vector<BoundaryFace>& faces, int lab
       if (a > b || std::max(d[a], d[b]) <= nearby) continue;  // an edge of two triangles once
       for (int k = 1; k < pieces; ++k) {
         const double part = double(k) / pieces;
-        measure(P.points[a] + part * (P.points[b] - P.points[a]), P.u[a] + part * (P.u[b] - P.u[a]));
+        measure(P.points[a] + part * (P.points[b] - P.points[a]),
+                P.u[a] + part * (P.u[b] - P.u[a]));
       }
     }
 }
@@ -3094,7 +3095,7 @@ struct SlideGuard {
   Mesh& M;
   double allowed;
   std::vector<BoundaryTriangle> faces;
-  std::vector<double> bound;             // [faces] of the distance, as far as it is known
+  std::vector<double> bound;              // [faces] of the distance, as far as it is known
   std::vector<std::vector<int>> facesAt;  // [nodes]
 
   SlideGuard(Mesher& W, double most) : M(W.M), allowed(most), facesAt(W.M.x.size()) {
@@ -3240,7 +3241,8 @@ int bisectStuck(Mesher& W, double lowest) {
   for (std::size_t E = 0; E < q.size(); ++E) {
     bool held = false;
     for (int label : W.M.faceLabel[E]) held |= label < 0;
-    if (held && q[E] < std::min(stuckQuality, stuckPart * lowest)) B.bisect(static_cast<int>(E)), ++stuck;
+    if (held && q[E] < std::min(stuckQuality, stuckPart * lowest))
+      B.bisect(static_cast<int>(E)), ++stuck;
   }
   return stuck;
 }
@@ -6433,8 +6435,8 @@ void optimizeAround(Mesh& M, const Insertion& I, InsertReport& report) {
     if (!valid) optimize.active.clear(), optimize.maxTangledSweeps = patientSweeps;
     OptimizeReport after = optimizeMesh(trial, optimize);
     after.sweeps += best.sweeps;
-    const bool better = valid ? after.inverted == 0 && after.minQ > best.minQ
-                              : after.inverted < best.inverted;
+    const bool better =
+        valid ? after.inverted == 0 && after.minQ > best.minQ : after.inverted < best.inverted;
     if (!better && (!valid || factor == wide)) return;
     if (!better) factor = wide;
     if (better) M = std::move(trial), best = after;

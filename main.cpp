@@ -3702,8 +3702,9 @@ constexpr Option maxTetsOption{"--max-tets", "N",
                                "refuse where more tetrahedra are predicted (default 20000000)"};
 constexpr Option quietOption{"--quiet", "", "no progress on standard error"};
 
-const std::vector<Command>& commands() {
-  static const std::vector<Command> all{
+/// The commands that make a mesh of a domain.
+std::vector<Command> makingCommands() {
+  return {
       {"box",
        "",
        "Makes the tetrahedral mesh of a box: six Kuhn tetrahedra for each cell.",
@@ -3716,9 +3717,9 @@ const std::vector<Command>& commands() {
        runBox},
       {"terrain",
        "DEM.asc",
-       "Makes the tetrahedral mesh between a terrain and a flat top by Algorithm 1, and prints "
-       "its\n"
-       "quality. The terrain is an ESRI ASCII grid (heights in the unit of the cells), bilinear\n"
+       "Makes the tetrahedral mesh between a terrain and a flat top by Algorithm 1, and prints\n"
+       "its quality. The terrain is an ESRI ASCII grid (heights in the unit of the cells), "
+       "bilinear\n"
        "between its points.",
        1,
        1,
@@ -3750,10 +3751,16 @@ const std::vector<Command>& commands() {
         threadsOption,
         maxTetsOption,
         quietOption},
-       runSolid},
+       runSolid}};
+}
+
+/// The commands that change a mesh.
+std::vector<Command> changingCommands() {
+  return {
       {"insert",
        "MESH.vtk SURFACE [SURFACE ...]",
-       "Inserts triangulated surfaces into a mesh that meccano wrote, the largest first, and prints\n"
+       "Inserts triangulated surfaces into a mesh that meccano wrote, the largest first, and "
+       "prints\n"
        "Table I: the quality of the original, refined, projected and smoothed mesh, against its\n"
        "computational elements. A surface of several components becomes several.\n"
        "Surfaces are read from OBJ, OFF, STL, PLY and GOCAD TSurf files, several of a file too.",
@@ -3791,7 +3798,12 @@ const std::vector<Command>& commands() {
         powerOption,
         threadsOption,
         quietOption},
-       runOptimize},
+       runOptimize}};
+}
+
+/// The commands that show a mesh, or write it otherwise.
+std::vector<Command> showingCommands() {
+  return {
       {"stats",
        "MESH",
        "Prints the quality statistics of a tetrahedral mesh, as in Table I.",
@@ -3826,6 +3838,15 @@ const std::vector<Command>& commands() {
        2,
        {},
        runConvert}};
+}
+
+const std::vector<Command>& commands() {
+  static const std::vector<Command> all = [] {
+    std::vector<Command> joined = makingCommands();
+    for (const auto& more : {changingCommands(), showingCommands()})
+      joined.insert(joined.end(), more.begin(), more.end());
+    return joined;
+  }();
   return all;
 }
 

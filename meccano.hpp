@@ -230,12 +230,12 @@ struct OptimizeOptions {
 };
 
 struct OptimizeReport {
-  int sweeps = 0;          // of all phases
-  double disp = 0;         // of Algorithm 2's last sweep (before the worst elements), as maxDisp
+  int sweeps = 0;   // of all phases
+  double disp = 0;  // of Algorithm 2's last sweep (before the worst elements), as maxDisp
   // valid and disp <= maxDisp (where the worst elements are lifted next: its root mean square <= 2
   // maxDisp) before maxSweeps
   bool converged = false;
-  int inverted = 0;        // elements with σ <= 0 left
+  int inverted = 0;  // elements with σ <= 0 left
   double minQ = 0, meanQ = 0;
 };
 
@@ -344,10 +344,10 @@ struct BoundaryMapping {
   struct Segment {
     std::array<int, 3> from, to;  // lattice, ascending
   };
-  std::vector<Rectangle> rectangles;           // [patches]
-  std::vector<Segment> segments;               // [curves], from s = 0
-  std::vector<std::array<int, 3>> cornersAt;   // [corners], lattice
-  std::vector<std::string> notes;              // what was chosen, for a progress display
+  std::vector<Rectangle> rectangles;          // [patches]
+  std::vector<Segment> segments;              // [curves], from s = 0
+  std::vector<std::array<int, 3>> cornersAt;  // [corners], lattice
+  std::vector<std::string> notes;             // what was chosen, for a progress display
 };
 /// Π on the boundary: a box without placed corners is cut into its sides automatically, a polycube
 /// with placed corners along shortest paths between them.
@@ -760,8 +760,8 @@ using Selection = std::vector<unsigned char>;
 /// S_M as squares, before and after 3.5's work on its outline.
 struct Extraction {
   Selection selected;
-  double energy = 0;  // what sides are ranked by: rim energy and interior coverage
-  std::string fault;  // why it is no disk, or cannot be used; empty: it is one
+  double energy = 0;       // what sides are ranked by: rim energy and interior coverage
+  std::string fault;       // why it is no disk, or cannot be used; empty: it is one
   bool isBlocked = false;  // because another surface is in the way
 };
 /// [§3.4] The squares with all nodes on this side (±1) of S, one disk; then the outline's healing:

@@ -4,10 +4,10 @@
 // writes them): shaken cubes, projected sheets, turned inner cubes. Seconds are CPU time of the
 // optimizer alone; E = mean η − 1.
 #define MECCANO_NO_MAIN
-#include "../main.cpp"
-
 #include <ctime>
 #include <filesystem>
+
+#include "../main.cpp"
 
 namespace {
 

@@ -327,7 +327,8 @@ inline double diagonal(const TriangleSurface& S) {
   return norm(high - low);
 }
 
-// ==== The steps of §3, and what a mesh looks like after them ======================================
+// ==== The steps of §3, and what a mesh looks like after them
+// ======================================
 
 /// A mesh and a surface on their way through 3.2 to 3.5, step by step.
 struct Steps {
@@ -354,7 +355,8 @@ struct Steps {
 /// Whether two lists hold the same bytes.
 template <class T>
 bool sameBytes(const std::vector<T>& a, const std::vector<T>& b) {
-  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0);
+  return a.size() == b.size() &&
+         (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(T)) == 0);
 }
 
 /// Whether two meshes are the same, byte for byte.
@@ -410,7 +412,8 @@ inline bool facesInBox(Vec3 a, Vec3 b, Vec3 c, Vec3 low, Vec3 high) {
   return true;
 }
 
-/// S_M as sets, counted from its faces: edges with their number of faces; nodes, 2 on the rim, else 1.
+/// S_M as sets, counted from its faces: edges with their number of faces; nodes, 2 on the rim,
+/// else 1.
 struct SurfaceSets {
   std::set<Face> faces;
   std::map<Edge, int> edges;

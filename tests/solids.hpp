@@ -41,7 +41,8 @@ inline TriangleSurface ball(int n, const std::function<Vec3(Vec3)>& map) {
             auto at = [&](int a, int b) { return point(sx * a, sy * b, sz * (n - a - b)); };
             const bool out = sx * sy * sz > 0;
             auto add = [&](int a, int b, int c) {
-              S.triangles.push_back(out ? std::array<int, 3>{a, b, c} : std::array<int, 3>{a, c, b});
+              S.triangles.push_back(out ? std::array<int, 3>{a, b, c}
+                                        : std::array<int, 3>{a, c, b});
             };
             add(at(i, j), at(i + 1, j), at(i, j + 1));
             if (i + j + 2 <= n) add(at(i + 1, j), at(i + 1, j + 1), at(i, j + 1));
@@ -58,8 +59,8 @@ inline TriangleSurface ellipsoid(int n, Vec3 half) {
 /// A sphere with smooth bumps and dents.
 inline TriangleSurface blob(int n) {
   return ball(n, [](Vec3 p) {
-    const double r = 1 + .25 * std::sin(3 * p.x + 1) * std::cos(4 * p.y) +
-                     .15 * std::sin(5 * p.z + 2 * p.x);
+    const double r =
+        1 + .25 * std::sin(3 * p.x + 1) * std::cos(4 * p.y) + .15 * std::sin(5 * p.z + 2 * p.x);
     return r * p;
   });
 }
@@ -155,8 +156,7 @@ inline meccano::Meccano placed(const std::vector<Cube>& cubes,
     int bends = 0;  // directions along which the pattern of cubes changes, for a corner all three
     for (int axis = 0; axis < 3; ++axis) {
       bool changes = false;
-      for (int i = 0; i < 8; ++i)
-        changes |= (bits >> i & 1) != (bits >> (i ^ 1 << axis) & 1);
+      for (int i = 0; i < 8; ++i) changes |= (bits >> i & 1) != (bits >> (i ^ 1 << axis) & 1);
       bends += changes;
     }
     if (bends == 3) C.corners.push_back({p, map({double(p[0]), double(p[1]), double(p[2])})});
@@ -172,9 +172,7 @@ inline Vec3 warped(Vec3 p) {
 /// Places of its corners that miss them.
 inline Vec3 roughly(Vec3 p) { return warped(p) + Vec3{.13, -.1, .12}; }
 /// From the lattice of ring() to a torus of radius 1 with a tube of .4.
-inline Vec3 aroundTorus(Vec3 p) {
-  return {.9 * (p.x - 1.5), .9 * (p.y - 1.5), .8 * (p.z - .5)};
-}
+inline Vec3 aroundTorus(Vec3 p) { return {.9 * (p.x - 1.5), .9 * (p.y - 1.5), .8 * (p.z - .5)}; }
 
 /// The boundary faces of a mesh.
 inline std::vector<std::array<int, 3>> boundaryOf(const meccano::Mesh& M) {

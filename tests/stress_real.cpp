@@ -10,6 +10,7 @@
 #define MECCANO_NO_MAIN
 #include "../main.cpp"
 #include "shapes.hpp"
+#include "stress_rows.hpp"
 
 namespace {
 
@@ -56,9 +57,9 @@ struct Row {
 /// Single surfaces: faults at 1200 m, scans with the l_c that is chosen and at diagonal / 40, and
 /// those that must be refused.
 void addSingleRows(std::vector<Row>& all) {
-  for (const char* file : {"fault_red_mountain.obj", "fault_red_mountain_native.obj",
-                           "fault_northridge_frew_utm.obj",
-                           "WTRA-ORFZ-SFNV-Northridge_Frew_fault-CFM2.ts"}) {
+  for (const char* file :
+       {"fault_red_mountain.obj", "fault_red_mountain_native.obj", "fault_northridge_frew_utm.obj",
+        "WTRA-ORFZ-SFNV-Northridge_Frew_fault-CFM2.ts"}) {
     Row fault{file + std::string(" 1200"), {file}, 1200};
     fault.figures = {.45, 0, 0, 2};
     all.push_back(fault);
@@ -93,9 +94,8 @@ void addSingleRows(std::vector<Row>& all) {
 std::vector<Row> rows() {
   std::vector<Row> all;
   const Figures set{.35, .89, .2, 0};
-  const std::pair<const char*, Order> orders[] = {{"", Order::together},
-                                                  {" as listed", Order::asListed},
-                                                  {" reversed", Order::reversed}};
+  const std::pair<const char*, Order> orders[] = {
+      {"", Order::together}, {" as listed", Order::asListed}, {" reversed", Order::reversed}};
   for (const char* files : {"cfm_mojave", "cfm_puente_hills", "cfm_san_bernardino"})
     for (const auto& [suffix, order] : orders) {
       Row row{files + std::string(" 1200") + suffix, {files}, 1200};
@@ -217,13 +217,7 @@ std::string resultLine(const Mesh& M, const std::vector<InsertReport>& reports) 
       shift);
 }
 
-struct Arguments {
-  std::string data = "../shared/data", write;
-  bool list = false, exact = false, verbose = false, usage = false;
-  std::vector<std::string> texts;
-};
-
-bool run(Row row, const Arguments& a) {
+bool run(Row row, const stress::Arguments& a) {
   const std::clock_t start = std::clock();
   std::string text, fault;
   Mesh M;
@@ -266,40 +260,10 @@ bool run(Row row, const Arguments& a) {
   return fault.empty();
 }
 
-Arguments parse(int argc, char** argv) {
-  Arguments a;
-  for (int i = 1; i < argc; ++i) {
-    const std::string arg = argv[i];
-    if (arg == "--list")
-      a.list = true;
-    else if (arg == "--exact")
-      a.exact = true;
-    else if (arg == "--verbose")
-      a.verbose = true;
-    else if (arg == "--data" && i + 1 < argc)
-      a.data = argv[++i];
-    else if (arg == "--write" && i + 1 < argc)
-      a.write = argv[++i];
-    else if (arg[0] == '-')
-      a.usage = true;
-    else
-      a.texts.push_back(arg);
-  }
-  return a;
-}
-
-bool isSelected(const Row& row, const Arguments& a) {
-  if (a.texts.empty()) return !row.slow || a.list;
-  for (const std::string& text : a.texts)
-    if (row.name == text || (!row.slow && row.name.find(text) != std::string::npos && !a.exact))
-      return true;
-  return false;
-}
-
 }  // namespace
 
 int main(int argc, char** argv) {
-  const Arguments a = parse(argc, argv);
+  const stress::Arguments a = stress::parse(argc, argv);
   if (a.usage) {
     std::cerr << help;
     return 2;
@@ -310,7 +274,7 @@ int main(int argc, char** argv) {
   }
   int selected = 0, met = 0;
   for (const Row& row : rows()) {
-    if (!isSelected(row, a)) continue;
+    if (!stress::isSelected(row.name, row.slow, a)) continue;
     ++selected;
     if (a.list)
       std::cout << row.name << (row.slow ? " (slow)" : "") << std::endl;

@@ -11,6 +11,7 @@
 #include "../main.cpp"
 #include "../samples/surfaces.hpp"
 #include "solids.hpp"
+#include "stress_rows.hpp"
 
 namespace {
 
@@ -59,12 +60,19 @@ void addGenerated(std::vector<Row>& all) {
   all.push_back({"sphere", .005, sphere(fine), "", {}, {.55, .85}});
   all.push_back({"ellipsoid 1:2:4", .005, ellipsoid(fine, {1, 2, 4}), "", {}, {.5, .85}});
   all.push_back({"blob", .005, blob(fine), "", {}, {.42, .85}});
-  all.push_back({"L of three cubes", .005, polycube(ell(), 12, warped), "", placed(ell(), warped),
+  all.push_back({"L of three cubes",
+                 .005,
+                 polycube(ell(), 12, warped),
+                 "",
+                 placed(ell(), warped),
                  {.65, .85}});
-  all.push_back({"L of three cubes, rough corners", .005, polycube(ell(), 12, warped), "",
-                 placed(ell(), roughly), {.5, .85}});
-  all.push_back(
-      {"torus", .005, torus(1, .4, fine), "", placed(ring(), aroundTorus), {.55, .85}});
+  all.push_back({"L of three cubes, rough corners",
+                 .005,
+                 polycube(ell(), 12, warped),
+                 "",
+                 placed(ell(), roughly),
+                 {.5, .85}});
+  all.push_back({"torus", .005, torus(1, .4, fine), "", placed(ring(), aroundTorus), {.55, .85}});
   for (const char* name : {"sphere", "torus"})
     for (std::size_t k = 0, n = all.size(); k < n; ++k)
       if (all[k].name == name) {
@@ -98,8 +106,8 @@ void addTerrains(std::vector<Row>& all) {
     row.top = top;
     all.push_back(row);
   }
-  const std::pair<const char*, Figures> layers[] = {
-      {"dem_gran_canaria_east.asc", {.32, .96, .06}}, {"dem_el_hierro.asc", {.25, .95}}};
+  const std::pair<const char*, Figures> layers[] = {{"dem_gran_canaria_east.asc", {.32, .96, .06}},
+                                                    {"dem_el_hierro.asc", {.25, .95}}};
   const std::pair<const char*, std::vector<double>> orders[] = {{"layers", {1000, 2000}},
                                                                 {"layers downwards", {2000, 1000}}};
   for (const auto& [file, figures] : layers)
@@ -159,8 +167,8 @@ QualityStatistics insertLayers(const Row& row, const Terrain& T, Mesh& M) {
   options.lc = lc, options.optimize.threads = 1;
   QualityStatistics q;
   for (double height : row.layers.heights)
-    q = insertSurface(
-            M, samples::layer(samples::smoothed(T, row.layers.smoothed), height, margin), options)
+    q = insertSurface(M, samples::layer(samples::smoothed(T, row.layers.smoothed), height, margin),
+                      options)
             .smoothed;
   return q;
 }
@@ -174,21 +182,14 @@ std::string missed(const Figures& figures, const Measured& m) {
   demand(m.toSolid <= 1 && m.toMesh <= 1, "distance");
   demand(m.q.min >= figures.min, format("min < %.2f", figures.min));
   demand(m.q.mean >= figures.mean, format("mean < %.2f", figures.mean));
-  demand(figures.stdDev == 0 || m.q.stdDev <= figures.stdDev,
-         format("std > %.2f", figures.stdDev));
+  demand(figures.stdDev == 0 || m.q.stdDev <= figures.stdDev, format("std > %.2f", figures.stdDev));
   demand(figures.seconds == 0 || m.seconds <= figures.seconds,
          format("more than %.0f s", figures.seconds));
   return text;
 }
 
-struct Arguments {
-  std::string data = "../shared/data", write;
-  bool list = false, exact = false, verbose = false, usage = false;
-  std::vector<std::string> texts;
-};
-
 /// The row's mesh, and what is measured of it.
-Measured meshOf(Row& row, const Arguments& a, Mesh& M) {
+Measured meshOf(Row& row, const stress::Arguments& a, Mesh& M) {
   MesherOptions options;
   options.meccano = row.C, options.fixedBoundary = row.fixedBoundary;
   options.optimize.threads = 1;
@@ -224,16 +225,16 @@ void writeRow(std::string name, const std::string& prefix, const Mesh& M) {
   writeFiles({{prefix + name + ".vtk", vtkText(M)}});
 }
 
-bool run(Row row, const Arguments& a) {
+bool run(Row row, const stress::Arguments& a) {
   std::string text, fault;
   const std::clock_t start = std::clock();
   try {
     Mesh M;
     const Measured m = meshOf(row, a, M);
     fault = missed(row.figures, m);
-    text = format(
-        "%7d tets, inverted %d, min %.3f mean %.3f std %.3f, of eps %.3f %.3f, %5.1f s",
-        m.q.tetrahedra, m.inverted, m.q.min, m.q.mean, m.q.stdDev, m.toSolid, m.toMesh, m.seconds);
+    text = format("%7d tets, inverted %d, min %.3f mean %.3f std %.3f, of eps %.3f %.3f, %5.1f s",
+                  m.q.tetrahedra, m.inverted, m.q.min, m.q.mean, m.q.stdDev, m.toSolid, m.toMesh,
+                  m.seconds);
     if (!a.write.empty()) writeRow(row.name, a.write, M);
   } catch (const Error& error) {
     text = std::string("refused: ") + error.what() +
@@ -245,46 +246,17 @@ bool run(Row row, const Arguments& a) {
   return fault.empty();
 }
 
-Arguments parse(int argc, char** argv) {
-  Arguments a;
-  for (int i = 1; i < argc; ++i) {
-    const std::string arg = argv[i];
-    if (arg == "--list")
-      a.list = true;
-    else if (arg == "--exact")
-      a.exact = true;
-    else if (arg == "--verbose")
-      a.verbose = true;
-    else if (arg == "--data" && i + 1 < argc)
-      a.data = argv[++i];
-    else if (arg == "--write" && i + 1 < argc)
-      a.write = argv[++i];
-    else if (arg[0] == '-')
-      a.usage = true;
-    else
-      a.texts.push_back(arg);
-  }
-  return a;
-}
-
-bool isSelected(const Row& row, const Arguments& a) {
-  if (a.texts.empty()) return true;
-  for (const std::string& text : a.texts)
-    if (a.exact ? row.name == text : row.name.find(text) != std::string::npos) return true;
-  return false;
-}
-
 }  // namespace
 
 int main(int argc, char** argv) {
-  const Arguments a = parse(argc, argv);
+  const stress::Arguments a = stress::parse(argc, argv);
   if (a.usage) {
     std::cerr << help;
     return 2;
   }
   int selected = 0, met = 0;
   for (const Row& row : rows()) {
-    if (!isSelected(row, a)) continue;
+    if (!stress::isSelected(row.name, false, a)) continue;
     if (a.list) {
       std::cout << row.name << std::endl;
     } else if (!row.file.empty() && !fs::exists(a.data + "/" + row.file)) {

@@ -439,8 +439,14 @@ TEST_SUITE("2") {
   }
 
   TEST_CASE("box: sizes that leave no digits for the cells are refused") {
-    CHECK(contains(messageOf<InputError>([] { boxMesh({1e20, 0, 0}, {1, 1, 1}, {2, 2, 2}); }), "digits"));
-    CHECK(contains(messageOf<InputError>([] { boxMesh({0, 0, 0}, {1e300, 1, 1}, {1, 1, 1}); }), "digits"));
+    CHECK(contains(messageOf<InputError>([] {
+                     boxMesh({1e20, 0, 0}, {1, 1, 1}, {2, 2, 2});
+                   }),
+                   "digits"));
+    CHECK(contains(messageOf<InputError>([] {
+                     boxMesh({0, 0, 0}, {1e300, 1, 1}, {1, 1, 1});
+                   }),
+                   "digits"));
   }
 
   TEST_CASE("neighbours: two tetrahedra see each other across their common face") {

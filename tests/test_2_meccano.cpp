@@ -1,7 +1,5 @@
 // SPDX-License-Identifier: MIT
 // Section 2: solids, meccanos and the boundary mapping of Algorithm 1.
-#include "../meccano.hpp"
-
 #include <doctest/doctest.h>
 
 #include <algorithm>
@@ -12,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "../meccano.hpp"
 #include "shapes.hpp"
 #include "solids.hpp"
 
@@ -40,7 +39,8 @@ std::vector<MappedSolid> mappedSolids() {
   for (MappedSolid& s : all) s.C = getMeccano(s.D);
   all.push_back({"L of three cubes", solids::polycube(solids::ell(), 6, solids::warped),
                  solids::placed(solids::ell(), solids::roughly)});
-  all.push_back({"torus", solids::torus(1, .4, 14), solids::placed(solids::ring(), solids::aroundTorus)});
+  all.push_back(
+      {"torus", solids::torus(1, .4, 14), solids::placed(solids::ring(), solids::aroundTorus)});
   all.push_back({"two handles", solids::polycube(solids::twoHandles(), 4, solids::warped),
                  solids::placed(solids::twoHandles(), solids::roughly)});
   return all;
@@ -134,7 +134,8 @@ TEST_SUITE("2") {
     }
   }
 
-  TEST_CASE("Algorithm 1: Pi is bijective and covers the solid, patches are what the meccano says") {
+  TEST_CASE(
+      "Algorithm 1: Pi is bijective and covers the solid, patches are what the meccano says") {
     for (const MappedSolid& s : mappedSolids()) {
       CAPTURE(s.name);
       const BoundaryMapping Pi = getBoundaryMapping(s.C, s.D);
@@ -148,8 +149,8 @@ TEST_SUITE("2") {
         const double squares = (R.hi[u] - R.lo[u]) * (R.hi[v] - R.lo[v]) * areaInU(P);
         int samePlane = 0;
         for (const BoundaryMapping::Rectangle& other : Pi.rectangles)
-          samePlane += other.axis == R.axis && other.side == R.side &&
-                       other.lo[R.axis] == R.lo[R.axis];
+          samePlane +=
+              other.axis == R.axis && other.side == R.side && other.lo[R.axis] == R.lo[R.axis];
         if (samePlane == 1) CHECK(squares == doctest::Approx(squaresIn(s.C, R)));
         CHECK(squares == doctest::Approx(std::round(squares)));
         area += areaOf(P.points, P.triangles);
@@ -284,7 +285,8 @@ TEST_SUITE("2") {
   }
 
   TEST_CASE("the first placement on refined meccanos is nearly valid") {
-    const std::map<std::string, std::pair<int, double>> wanted{  // most inverted, least mean q
+    const std::map<std::string, std::pair<int, double>> wanted{
+        // most inverted, least mean q
         {"sphere", {0, .86}},           {"ellipsoid", {0, .86}}, {"blob", {100, .80}},
         {"L of three cubes", {12, .9}}, {"torus", {0, .83}},     {"two handles", {40, .9}}};
     for (const MappedSolid& s : mappedSolids()) {
@@ -312,8 +314,8 @@ TEST_SUITE("2") {
       for (const Meccano::Placed& placed : all[k].C.corners) {
         double nearest = 1e300;
         for (const Vec3& p : all[k].D.points) nearest = std::min(nearest, norm(p - placed.x));
-        const BoundaryPoint at = boundaryPoint(
-            Pi, {double(placed.at[0]), double(placed.at[1]), double(placed.at[2])});
+        const BoundaryPoint at =
+            boundaryPoint(Pi, {double(placed.at[0]), double(placed.at[1]), double(placed.at[2])});
         CHECK(at.dimension == 0);
         CHECK(norm(at.x - placed.x) == nearest);
       }
@@ -442,9 +444,7 @@ TEST_SUITE("2") {
     CHECK(has(refusal(C, ball), "the solid has 0 handles and the polycube 1"));
     CHECK(has(refusal(C, torus), "add a line `corner i j k x y z`"));
 
-    auto place = [](Vec3 p) {
-      return Vec3{.9 * (p.x - 1.5), .9 * (p.y - 1.5), .8 * (p.z - .5)};
-    };
+    auto place = [](Vec3 p) { return Vec3{.9 * (p.x - 1.5), .9 * (p.y - 1.5), .8 * (p.z - .5)}; };
     const Meccano good = solids::placed(solids::ring(), place);
     C = good;
     C.corners.pop_back();

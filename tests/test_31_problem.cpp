@@ -1,8 +1,5 @@
 // SPDX-License-Identifier: MIT
 // §3.1: what a surface must be, and the distance tools of §3.2 and §3.4.
-#include "../meccano.hpp"
-#include "../samples/surfaces.hpp"
-
 #include <doctest/doctest.h>
 
 #include <cmath>
@@ -10,6 +7,8 @@
 #include <string>
 #include <vector>
 
+#include "../meccano.hpp"
+#include "../samples/surfaces.hpp"
 #include "shapes.hpp"
 
 using namespace meccano;
@@ -116,16 +115,20 @@ double searchedDistance(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
     double lo = 0, hi = 1;
     for (int i = 0; i < 100; ++i) {
       double t1 = lo + (hi - lo) / 3, t2 = hi - (hi - lo) / 3;
-      if (norm(x - (p + t1 * (q - p))) < norm(x - (p + t2 * (q - p)))) hi = t2;
-      else lo = t1;
+      if (norm(x - (p + t1 * (q - p))) < norm(x - (p + t2 * (q - p))))
+        hi = t2;
+      else
+        lo = t1;
     }
     return norm(x - (p + lo * (q - p)));
   };
   double lo = 0, hi = 1;
   for (int i = 0; i < 100; ++i) {
     double s1 = lo + (hi - lo) / 3, s2 = hi - (hi - lo) / 3;
-    if (along(s1) < along(s2)) hi = s2;
-    else lo = s1;
+    if (along(s1) < along(s2))
+      hi = s2;
+    else
+      lo = s1;
   }
   return along(lo);
 }
@@ -364,8 +367,11 @@ TEST_SUITE("3.2") {
 }
 
 TEST_SUITE("3.1") {
-  TEST_CASE("selfCrossings: none on embedded surfaces, pairs and place where a strip passes through itself") {
-    for (const TriangleSurface& S : {samples::sine(.2, 24), samples::helicoid(.5), samples::raggedRim(), samples::disc()})
+  TEST_CASE(
+      "selfCrossings: none on embedded surfaces, pairs and place where a strip passes through "
+      "itself") {
+    for (const TriangleSurface& S :
+         {samples::sine(.2, 24), samples::helicoid(.5), samples::raggedRim(), samples::disc()})
       CHECK(selfCrossings(S).empty());
     // a loop like the letter alpha: its ends cross on the line x = 0, z = 1
     const TriangleSurface alpha = samples::sheet(41, 4, [](double s, double t) {
@@ -397,8 +403,12 @@ TEST_SUITE("3.1") {
       CHECK(shapes::sameMesh(M, before));
     }
     // two triangles with a common point, one edge through the other
-    CHECK(selfCrossings({{{0, 0, 0}, {2, 0, 0}, {0, 2, 0}, {1, .5, -1}, {.5, 1, 1}}, {{0, 1, 2}, {0, 3, 4}}}).size() == 1);
-    CHECK(selfCrossings({{{0, 0, 0}, {2, 0, 0}, {0, 2, 0}, {-1, -.5, -1}, {-.5, -1, 1}}, {{0, 1, 2}, {0, 3, 4}}}).empty());
+    CHECK(selfCrossings(
+              {{{0, 0, 0}, {2, 0, 0}, {0, 2, 0}, {1, .5, -1}, {.5, 1, 1}}, {{0, 1, 2}, {0, 3, 4}}})
+              .size() == 1);
+    CHECK(selfCrossings({{{0, 0, 0}, {2, 0, 0}, {0, 2, 0}, {-1, -.5, -1}, {-.5, -1, 1}},
+                         {{0, 1, 2}, {0, 3, 4}}})
+              .empty());
   }
 }
 

@@ -21,13 +21,15 @@ namespace {
 using Tetrahedron = std::array<Vec3, 4>;
 using Triangle = std::array<Vec3, 3>;
 
-/// Separating axes, which share no step with clipping: the widest gap between the projections of both
-/// on the normals of either and on the cross products of their edges; at most 0 where they meet.
+/// Separating axes, which share no step with clipping: the widest gap between the projections of
+/// both on the normals of either and on the cross products of their edges; at most 0 where they
+/// meet.
 double separation(const Tetrahedron& tet, const Triangle& triangle) {
   std::vector<Vec3> axes, edges;
   for (int i = 0; i < 4; ++i)
     for (int j = 0; j < i; ++j) edges.push_back(tet[i] - tet[j]);
-  const Vec3 a = triangle[1] - triangle[0], b = triangle[2] - triangle[1], c = triangle[0] - triangle[2];
+  const Vec3 a = triangle[1] - triangle[0], b = triangle[2] - triangle[1],
+             c = triangle[0] - triangle[2];
   const Vec3 normal = cross(a, c);
   for (int i = 0; i < 4; ++i) {
     const Vec3 p = tet[(i + 1) % 4], q = tet[(i + 2) % 4], r = tet[(i + 3) % 4];
@@ -43,9 +45,11 @@ double separation(const Tetrahedron& tet, const Triangle& triangle) {
     if (norm(axis) < 1e-12) continue;
     axis = (1 / norm(axis)) * axis;
     double tetLow = 1e300, tetHigh = -1e300, triangleLow = 1e300, triangleHigh = -1e300;
-    for (Vec3 p : tet) tetLow = std::min(tetLow, dot(axis, p)), tetHigh = std::max(tetHigh, dot(axis, p));
+    for (Vec3 p : tet)
+      tetLow = std::min(tetLow, dot(axis, p)), tetHigh = std::max(tetHigh, dot(axis, p));
     for (Vec3 p : triangle)
-      triangleLow = std::min(triangleLow, dot(axis, p)), triangleHigh = std::max(triangleHigh, dot(axis, p));
+      triangleLow = std::min(triangleLow, dot(axis, p)),
+      triangleHigh = std::max(triangleHigh, dot(axis, p));
     widest = std::max({widest, triangleLow - tetHigh, tetLow - triangleHigh});
   }
   return widest;
@@ -117,7 +121,8 @@ Mesh bentBox() {
   Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
   for (std::size_t n = 0; n < M.x.size(); ++n) {
     const Vec3 p = M.x[n];
-    const double bump = std::sin(samples::pi * p.x) * std::sin(samples::pi * p.y) * std::sin(samples::pi * p.z);
+    const double bump =
+        std::sin(samples::pi * p.x) * std::sin(samples::pi * p.y) * std::sin(samples::pi * p.z);
     if (M.dimension[n] == 3) M.x[n] = p + bump * Vec3{.06, -.04, .05};
   }
   return M;
@@ -125,7 +130,9 @@ Mesh bentBox() {
 
 /// A small flat sheet about c.
 TriangleSurface sheetAt(Vec3 c, double half) {
-  return samples::sheet(4, 4, [=](double s, double t) { return c + Vec3{half * s, half * t, .1 * half * s * t}; });
+  return samples::sheet(4, 4, [=](double s, double t) {
+    return c + Vec3{half * s, half * t, .1 * half * s * t};
+  });
 }
 
 /// The text of the InputError that refuses S and options; M must be untouched, no stage reached.
@@ -151,16 +158,20 @@ std::string refusal(const TriangleSurface& S, double lc) {
   return refusal(M, S, options);
 }
 
-bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+bool has(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
 
-/// A gutter: two parallel planes of height 1 and length 2 with this distance, joined by half a cylinder.
+/// A gutter: two parallel planes of height 1 and length 2 with this distance, joined by half a
+/// cylinder.
 TriangleSurface gutter(double distance) {
   const double R = distance / 2, length = 2 + samples::pi * R;
   return samples::sheet(60, 20, [=](double s, double t) {
     const double a = .5 * length * s, bent = samples::pi * R / 2, over = std::abs(a) - bent;
     const double angle = std::clamp(a, -bent, bent) / R, side = a > 0 ? 1 : -1;
     return Vec3{R * std::sin(angle), t, -R * std::cos(angle)} + Vec3{0, 0, over > 0 ? over : 0} +
-           (over > 0 ? Vec3{side * R, 0, 0} - Vec3{R * std::sin(angle), 0, -R * std::cos(angle)} : Vec3{});
+           (over > 0 ? Vec3{side * R, 0, 0} - Vec3{R * std::sin(angle), 0, -R * std::cos(angle)}
+                     : Vec3{});
   });
 }
 
@@ -170,7 +181,8 @@ TriangleSurface flatStrip(double width, Vec3 c = {}) {
 }
 
 /// What chooseSize() says of S in a box that is far away, or this mesh.
-SizeChoice sizeOf(const TriangleSurface& S, const Mesh& M = boxMesh({-9, -9, -9}, {18, 18, 18}, {2, 2, 2})) {
+SizeChoice sizeOf(const TriangleSurface& S,
+                  const Mesh& M = boxMesh({-9, -9, -9}, {18, 18, 18}, {2, 2, 2})) {
   return chooseSize(M, SurfaceDistance(S));
 }
 
@@ -208,10 +220,11 @@ TEST_SUITE("3.2") {
       TriangleSurface S;
       double lc;
     };
-    const std::vector<Try> tries = {{boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), samples::sine(.1, 10), .2},
-                                    {boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), sheetAt({.45, .5, .55}, .22), .2},
-                                    {boxMesh({0, 0, 0}, {1, 1, 1}, {3, 1, 2}), samples::sine(.15, 10), .25},
-                                    {bentBox(), samples::sine(.1, 10), .2}};
+    const std::vector<Try> tries = {
+        {boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), samples::sine(.1, 10), .2},
+        {boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), sheetAt({.45, .5, .55}, .22), .2},
+        {boxMesh({0, 0, 0}, {1, 1, 1}, {3, 1, 2}), samples::sine(.15, 10), .25},
+        {bentBox(), samples::sine(.1, 10), .2}};
     for (std::size_t i = 0; i < tries.size(); ++i) {
       CAPTURE(i);
       Steps steps(tries[i].M, tries[i].S);
@@ -230,7 +243,8 @@ TEST_SUITE("3.2") {
         uncovered += at.empty();
         for (int E : at) {
           outside += !T[E];
-          large += literalLongestEdge(M.xi, M.tets[E]) * M.cube.x >= tries[i].lc && M.cube.x == M.cube.y;
+          large +=
+              literalLongestEdge(M.xi, M.tets[E]) * M.cube.x >= tries[i].lc && M.cube.x == M.cube.y;
           large += longestEdge(M, E) >= tries[i].lc;
         }
       }
@@ -241,7 +255,8 @@ TEST_SUITE("3.2") {
       int wrong = 0, level = 0;
       for (std::size_t E = 0; E < M.tets.size(); ++E) {
         double nearest = 1e300;
-        const Tetrahedron tet{M.x[M.tets[E][0]], M.x[M.tets[E][1]], M.x[M.tets[E][2]], M.x[M.tets[E][3]]};
+        const Tetrahedron tet{M.x[M.tets[E][0]], M.x[M.tets[E][1]], M.x[M.tets[E][2]],
+                              M.x[M.tets[E][3]]};
         if (!T[E] && E % 7 != 0) continue;  // of the others a sample
         for (const auto& t : tries[i].S.triangles) {
           const auto& p = tries[i].S.points;
@@ -313,18 +328,20 @@ TEST_SUITE("3.2") {
 
   TEST_CASE("intersects: a face in common, a tetrahedron around or across the triangle") {
     const Tetrahedron tet{{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
-    CHECK(intersects(tet, {tet[0], tet[1], tet[2]}));                                    // its face
-    CHECK(intersects(tet, {{{-5, -5, 0}, {5, -5, 0}, {0, 9, 0}}}));                      // covers the face
-    CHECK(intersects(tet, {{{-5, -5, .3}, {5, -5, .3}, {0, 9, .3}}}));                   // cuts through
-    CHECK(intersects(tet, {{{.1, .1, .1}, {.2, .1, .1}, {.1, .2, .2}}}));                // inside
-    CHECK(intersects(tet, {{{1, 0, 0}, {2, 0, 0}, {2, 1, 0}}}));                         // a vertex
+    CHECK(intersects(tet, {tet[0], tet[1], tet[2]}));                      // its face
+    CHECK(intersects(tet, {{{-5, -5, 0}, {5, -5, 0}, {0, 9, 0}}}));        // covers the face
+    CHECK(intersects(tet, {{{-5, -5, .3}, {5, -5, .3}, {0, 9, .3}}}));     // cuts through
+    CHECK(intersects(tet, {{{.1, .1, .1}, {.2, .1, .1}, {.1, .2, .2}}}));  // inside
+    CHECK(intersects(tet, {{{1, 0, 0}, {2, 0, 0}, {2, 1, 0}}}));           // a vertex
     CHECK_FALSE(intersects(tet, {{{1.001, 0, 0}, {2, 0, 0}, {2, 1, 0}}}));
     CHECK_FALSE(intersects(tet, {{{-5, -5, -.001}, {5, -5, -.001}, {0, 9, -.001}}}));
-    CHECK_FALSE(intersects(tet, {{{.34, .34, .34}, {2, .34, .34}, {.34, 2, .34}}}));     // beyond the skew face
+    CHECK_FALSE(intersects(
+        tet, {{{.34, .34, .34}, {2, .34, .34}, {.34, 2, .34}}}));  // beyond the skew face
   }
 
   TEST_CASE("limits: l_c must be above 0 and finite") {
-    const double nan = std::numeric_limits<double>::quiet_NaN(), infinite = std::numeric_limits<double>::infinity();
+    const double nan = std::numeric_limits<double>::quiet_NaN(),
+                 infinite = std::numeric_limits<double>::infinity();
     for (double lc : {-1., nan, infinite, -infinite}) {
       CAPTURE(lc);
       const std::string text = refusal(samples::sine(.1, 8), lc);
@@ -333,7 +350,8 @@ TEST_SUITE("3.2") {
     }
   }
 
-  TEST_CASE("limits: l_c must be below dist(dM, S); the message has both numbers and the triangle") {
+  TEST_CASE(
+      "limits: l_c must be below dist(dM, S); the message has both numbers and the triangle") {
     const TriangleSurface S = sheetAt({.5, .5, .3}, .2);  // .28 .. .32 in z: .28 from the bottom
     for (double lc : {.281, .5, 1e6}) {
       const std::string text = refusal(S, lc);
@@ -395,7 +413,8 @@ TEST_SUITE("3.2") {
     CHECK(size.finest <= size.lc / 4);
   }
 
-  TEST_CASE("chooseSize: two facing sheets get two cubes between them, the place is on one of them") {
+  TEST_CASE(
+      "chooseSize: two facing sheets get two cubes between them, the place is on one of them") {
     for (double distance : {.02, .04, .08}) {
       CAPTURE(distance);
       const TriangleSurface S = gutter(distance);
@@ -412,7 +431,8 @@ TEST_SUITE("3.2") {
   TEST_CASE("chooseSize: a strip gets one and a half cubes across, a square none for its width") {
     for (double width : {.05, .08}) {
       CAPTURE(width);
-      CHECK(rimWidth(SurfaceDistance(flatStrip(width)), .4).distance == doctest::Approx(width).epsilon(.02));
+      CHECK(rimWidth(SurfaceDistance(flatStrip(width)), .4).distance ==
+            doctest::Approx(width).epsilon(.02));
       const SizeChoice size = sizeOf(flatStrip(width));
       CHECK(has(size.feature, "rim"));
       CHECK(size.lc == doctest::Approx(std::sqrt(3.) * width / 1.5).epsilon(.02));
@@ -422,7 +442,9 @@ TEST_SUITE("3.2") {
     CHECK(rimWidth(SurfaceDistance(samples::raggedRim()), .2).distance > .1);  // noise is no width
   }
 
-  TEST_CASE("chooseSize: features too fine are not followed below 1/8, and the l_c that resolves them is told") {
+  TEST_CASE(
+      "chooseSize: features too fine are not followed below 1/8, and the l_c that resolves them is "
+      "told") {
     const SizeChoice strip = sizeOf(flatStrip(.002)), sheets = sizeOf(gutter(.002));
     CHECK(strip.lc == doctest::Approx(strip.finest));
     CHECK(strip.resolving == doctest::Approx(std::sqrt(3.) * .002 / 1.5).epsilon(.02));
@@ -430,7 +452,8 @@ TEST_SUITE("3.2") {
     CHECK(sheets.resolving < .5 * sheets.lc);
   }
 
-  TEST_CASE("chooseSize: near the boundary and near an earlier surface l_c stays below the distance") {
+  TEST_CASE(
+      "chooseSize: near the boundary and near an earlier surface l_c stays below the distance") {
     Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
     const SizeChoice low = sizeOf(sheetAt({.5, .5, .041}, .3), M);
     CHECK(has(low.feature, "boundary"));

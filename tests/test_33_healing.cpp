@@ -43,8 +43,8 @@ Counts countAt(const Mesh& M, const std::vector<int>& T, int n) {
   return {static_cast<int>(edges.size()), static_cast<int>(faces.size()), cells};
 }
 
-/// Whether the faces of dT at node n are one fan: their outer edges make one closed ring. The definition
-/// of a surface at n, without any Euler characteristic.
+/// Whether the faces of dT at node n are one fan: their outer edges make one closed ring. The
+/// definition of a surface at n, without any Euler characteristic.
 bool isOneFan(const Mesh& M, const std::vector<int>& T, int n) {
   std::map<Face, int> count;
   for (int E : T)
@@ -154,12 +154,16 @@ void checkHealed(const Mesh& M, const Approximation& A) {
     coarse += M.level[E] < A.level;
   }
   CHECK(coarse == 0);
-  CHECK(volume == doctest::Approx(static_cast<double>(cubes.size()) / (scale * scale * scale)).epsilon(1e-12));
+  CHECK(
+      volume ==
+      doctest::Approx(static_cast<double>(cubes.size()) / (scale * scale * scale)).epsilon(1e-12));
   // faces of dT: in lattice planes, parallel to a coordinate plane
   int skew = 0;
   std::set<int> nodes;
   for (const Face& f : boundaryOf(M, T)) {
-    auto flat = [&](double a, double b, double c) { return a == b && a == c && a * scale == std::floor(a * scale); };
+    auto flat = [&](double a, double b, double c) {
+      return a == b && a == c && a * scale == std::floor(a * scale);
+    };
     const Vec3 a = M.xi[f[0]], b = M.xi[f[1]], c = M.xi[f[2]];
     skew += !flat(a.x, b.x, c.x) && !flat(a.y, b.y, c.y) && !flat(a.z, b.z, c.z);
     nodes.insert(f.begin(), f.end());
@@ -193,13 +197,16 @@ void checkSquares(const Mesh& M, const Approximation& A, const SquareSurface& Q)
     REQUIRE(at.size() == 2);
     for (int k = 0; k < 2; ++k) {
       const Square& s = Q.squares[at[k].first];
-      wrong += s.across[at[k].second] != at[1 - k].first || s.acrossEdge[at[k].second] != at[1 - k].second;
+      wrong += s.across[at[k].second] != at[1 - k].first ||
+               s.acrossEdge[at[k].second] != at[1 - k].second;
       const Square& t = Q.squares[at[1 - k].first];  // oriented: the edge runs the other way there
       wrong += s.node[at[k].second] != t.node[(at[1 - k].second + 1) % 4];
     }
   }
   CHECK(wrong == 0);
-  CHECK(static_cast<int>(nodes.size()) - static_cast<int>(uses.size()) + static_cast<int>(Q.squares.size()) == 2);
+  CHECK(static_cast<int>(nodes.size()) - static_cast<int>(uses.size()) +
+            static_cast<int>(Q.squares.size()) ==
+        2);
   CHECK(std::vector<int>(nodes.begin(), nodes.end()) == Q.nodes);
   double area = 0, squares = 0;
   for (const Face& f : boundaryOf(M, elementsOf(A)))
@@ -236,7 +243,8 @@ TEST_SUITE("3.3") {
     }
   }
 
-  TEST_CASE("eq. (2): agrees with edges, faces and cells counted on the tetrahedra, all 255 cases") {
+  TEST_CASE(
+      "eq. (2): agrees with edges, faces and cells counted on the tetrahedra, all 255 cases") {
     for (bool refined : {false, true}) {
       const EightCubes eight(refined);
       REQUIRE(eight.node >= 0);
@@ -265,7 +273,8 @@ TEST_SUITE("3.3") {
     std::vector<int> around;
     for (std::size_t E = 0; E < eight.M.tets.size(); ++E) {
       const auto& z = eight.M.tets[E];
-      if (std::find(z.begin(), z.end(), eight.node) != z.end()) around.push_back(static_cast<int>(E));
+      if (std::find(z.begin(), z.end(), eight.node) != z.end())
+        around.push_back(static_cast<int>(E));
     }
     auto touch = [&](int E, int F) {  // share more than the node
       int common = 0;
@@ -310,7 +319,8 @@ TEST_SUITE("3.3") {
       shapes::Joined joined(8);
       for (int a = 0; a < 8; ++a)
         for (int b = 0; b < 8; ++b)
-          if ((mask >> a & 1) && (mask >> b & 1) && std::bitset<3>(a ^ b).count() == 1) joined.join(a, b);
+          if ((mask >> a & 1) && (mask >> b & 1) && std::bitset<3>(a ^ b).count() == 1)
+            joined.join(a, b);
       std::set<int> roots;
       for (int a = 0; a < 8; ++a)
         if (mask >> a & 1) roots.insert(joined.root(a));
@@ -323,8 +333,11 @@ TEST_SUITE("3.3") {
     const struct {
       TriangleSurface S;
       double lc;
-    } tries[] = {{samples::sine(.1, 24), .12}, {samples::plane(45, 45), .12}, {bumpySheet(), .2},
-                 {samples::randomPatch(4), .12}, {samples::threeLobed(), .1}};
+    } tries[] = {{samples::sine(.1, 24), .12},
+                 {samples::plane(45, 45), .12},
+                 {bumpySheet(), .2},
+                 {samples::randomPatch(4), .12},
+                 {samples::threeLobed(), .1}};
     for (const auto& t : tries) {
       CAPTURE(t.S.name);
       Steps steps(boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), t.S);
@@ -394,7 +407,8 @@ TEST_SUITE("3.3") {
     const Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {5, 5, 5});
     auto inner = [](int i) { return i >= 1 && i <= 3; };
     const Approximation tries[] = {
-        cells(M, [&](int i, int j, int k) { return k == 2 && inner(i) && inner(j) && !(i == 2 && j == 2); }),
+        cells(M, [&](int i, int j,
+                     int k) { return k == 2 && inner(i) && inner(j) && !(i == 2 && j == 2); }),
         cells(M, [](int i, int j, int k) { return j == 2 && k == 2 && (i == 1 || i == 3); }),
         cells(M, [&](int i, int j, int k) {
           return inner(i) && inner(j) && inner(k) && !(i == 2 && j == 2 && k == 2);

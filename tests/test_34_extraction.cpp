@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// §3.4: the squares of dT on one side of S; and the half squares of DESIGN 3.5, whose rules (a) to (d) are
-// checked here on the masks of the selection.
+// §3.4: the squares of dT on one side of S; and the half squares of DESIGN 3.5, whose rules (a) to
+// (d) are checked here on the masks of the selection.
 #include <doctest/doctest.h>
 
 #include <algorithm>
@@ -31,7 +31,8 @@ std::vector<Quarter> quartersOf(const SquareSurface& Q, const Selection& selecte
   for (std::size_t i = 0; i < Q.squares.size(); ++i)
     for (int e = 0; e < 4; ++e)
       if ((selected[i] >> e & 1) == (chosen ? 1 : 0))
-        quarters.push_back({static_cast<int>(i), e, Q.squares[i].node[e], Q.squares[i].node[(e + 1) % 4]});
+        quarters.push_back(
+            {static_cast<int>(i), e, Q.squares[i].node[e], Q.squares[i].node[(e + 1) % 4]});
   return quarters;
 }
 
@@ -50,7 +51,8 @@ std::set<int> cornersOf(const SquareSurface& Q, const Selection& selected) {
   return corners;
 }
 
-/// The side of x by the nearest triangle of S, all tried, where its foot is inside the triangle; else 0.
+/// The side of x by the nearest triangle of S, all tried, where its foot is inside the triangle;
+/// else 0.
 int literalSide(const TriangleSurface& S, Vec3 x) {
   double nearest = 1e300;
   int side = 0;
@@ -79,16 +81,19 @@ std::string ruleFault(const SquareSurface& Q, const Selection& selected) {
   auto isChosen = [&](const Quarter& q) { return (selected[q.square] >> q.e & 1) == 1; };
   for (const auto& [edge, at] : atEdge)
     if (isChosen(at[0]) != isChosen(at[1])) ++rimEdges[edge[0]], ++rimEdges[edge[1]];
-  for (std::size_t i = 0; i < Q.squares.size(); ++i)  // spokes: corner e lies between quarters e - 1 and e
+  for (std::size_t i = 0; i < Q.squares.size();
+       ++i)  // spokes: corner e lies between quarters e - 1 and e
     for (int e = 0; e < 4; ++e)
-      if ((selected[i] >> e & 1) != (selected[i] >> (e + 3) % 4 & 1)) ++rimEdges[Q.squares[i].node[e]];
+      if ((selected[i] >> e & 1) != (selected[i] >> (e + 3) % 4 & 1))
+        ++rimEdges[Q.squares[i].node[e]];
   for (std::size_t i = 0; i < Q.squares.size(); ++i) {
     const int mask = selected[i];
     if (mask != 0 && mask != 15 && mask != 3 && mask != 6 && mask != 12 && mask != 9)
       return "square " + std::to_string(i) + " is neither empty, full nor a half";
   }
   for (const auto& [n, count] : rimEdges)
-    if (count != 0 && count != 2) return "(a) node " + std::to_string(n) + " has " + std::to_string(count) + " rim edges";
+    if (count != 0 && count != 2)
+      return "(a) node " + std::to_string(n) + " has " + std::to_string(count) + " rim edges";
   for (const auto& [n, count] : quarters)
     if (count == 1) return "(c) node " + std::to_string(n) + " has one quarter";
   for (const auto& [edge, at] : atEdge)
@@ -115,7 +120,8 @@ double literalEnergy(const Steps& I, int side, const Selection& selected) {
     const Vec3 p = I.S.S.points[I.S.rim[corners.at[c]]];
     int nearest = -1;
     for (int n : Q.nodes)
-      if (onSide(n) && (nearest < 0 || norm2(I.M.x[n] - p) < norm2(I.M.x[nearest] - p))) nearest = n;
+      if (onSide(n) && (nearest < 0 || norm2(I.M.x[n] - p) < norm2(I.M.x[nearest] - p)))
+        nearest = n;
     sharp.insert(nearest);
   }
   double energy = 0;
@@ -140,8 +146,9 @@ struct Try {
   double lc;
 };
 std::vector<Try> tries() {
-  return {{samples::sine(.1, 32), .12}, {samples::plane(10, 0), .12},    {samples::plane(45, 45), .12},
-          {samples::disc(20), .12},     {samples::randomPatch(3), .12}, {samples::randomPatch(5), .12},
+  return {{samples::sine(.1, 32), .12},   {samples::plane(10, 0), .12},
+          {samples::plane(45, 45), .12},  {samples::disc(20), .12},
+          {samples::randomPatch(3), .12}, {samples::randomPatch(5), .12},
           {samples::threeLobed(), .1}};
 }
 
@@ -150,8 +157,9 @@ std::vector<Try> tries() {
 TEST_SUITE("3.4") {
   TEST_CASE("extraction: above a plane the squares with all corners on one side") {
     // z = .53 is in no lattice plane: dT has a floor and a ceiling
-    const TriangleSurface S =
-        samples::sheet(8, 8, [](double s, double t) { return Vec3{.5 + .25 * s, .5 + .25 * t, .53}; });
+    const TriangleSurface S = samples::sheet(8, 8, [](double s, double t) {
+      return Vec3{.5 + .25 * s, .5 + .25 * t, .53};
+    });
     Steps I(boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), S);
     I.approximate(.12);
     I.heal();
@@ -199,7 +207,8 @@ TEST_SUITE("3.4") {
           CHECK(wrong == 0);
           if (outline != Outline::paper) CHECK(known > 20);
           // S_M is the size of S
-          const double area = .25 * I.Q.h * I.Q.h * static_cast<double>(quartersOf(I.Q, X.selected, true).size());
+          const double area =
+              .25 * I.Q.h * I.Q.h * static_cast<double>(quartersOf(I.Q, X.selected, true).size());
           double areaS = 0;
           for (const auto& f : I.S.S.triangles) {
             const auto& p = I.S.S.points;
@@ -235,7 +244,8 @@ TEST_SUITE("3.4") {
       I.heal();
       const Extraction before = surfaceExtraction(I.M, I.Q, I.S, 1, outline);
       int taken = 0;
-      for (int n : cornersOf(I.Q, before.selected))  // as if another surface ran along x = const there
+      for (int n :
+           cornersOf(I.Q, before.selected))  // as if another surface ran along x = const there
         if (I.M.x[n].x < .25) I.M.dimension[n] = 2, ++taken;
       REQUIRE(taken > 3);
       const Extraction after = surfaceExtraction(I.M, I.Q, I.S, 1, outline);
@@ -261,7 +271,8 @@ TEST_SUITE("3.4") {
         for (unsigned char mask : X.selected) halves += mask != 0 && mask != 15;
         // a half needs its three corners on the side, a square all four
         int wrong = 0;
-        for (int n : cornersOf(I.Q, X.selected)) wrong += (I.S.query(I.M.x[n]).side >= 0 ? 1 : -1) != side;
+        for (int n : cornersOf(I.Q, X.selected))
+          wrong += (I.S.query(I.M.x[n]).side >= 0 ? 1 : -1) != side;
         CHECK(wrong == 0);
       }
     }
@@ -300,7 +311,8 @@ TEST_SUITE("3.4") {
         CAPTURE(t.S.name);
         const Extraction whole = surfaceExtraction(I.M, I.Q, I.S, side, Outline::squares);
         const Extraction halves = surfaceExtraction(I.M, I.Q, I.S, side, Outline::halfSquares);
-        const double E = literalEnergy(I, side, halves.selected), W = literalEnergy(I, side, whole.selected);
+        const double E = literalEnergy(I, side, halves.selected),
+                     W = literalEnergy(I, side, whole.selected);
         CHECK(E <= W + 1e-9);
         // what the sides are ranked by is this energy and the coverage, which is not negative
         CHECK(whole.energy >= W - 1e-9);
@@ -360,7 +372,8 @@ TEST_SUITE("3.4") {
           for (const Quarter& q : chosen) {
             const auto& n = I.Q.squares[q.square].node;
             const Vec3 centre = .5 * (I.M.xi[n[0]] + I.M.xi[n[2]]);
-            nearest = std::min(nearest, shapes::distanceToTriangle(middle, I.M.xi[q.a], I.M.xi[q.b], centre));
+            nearest = std::min(
+                nearest, shapes::distanceToTriangle(middle, I.M.xi[q.a], I.M.xi[q.b], centre));
           }
           astray += nearest > 1e-9;
         }

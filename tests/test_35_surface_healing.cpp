@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// §3.5: cases 1 to 6 and the full subcomplex, each on a small mesh that shows it; and all of them on
-// surfaces as extraction leaves them. The searches here count on the faces of S_M, edge by edge.
+// §3.5: cases 1 to 6 and the full subcomplex, each on a small mesh that shows it; and all of them
+// on surfaces as extraction leaves them. The searches here count on the faces of S_M, edge by edge.
 #include <doctest/doctest.h>
 
 #include <algorithm>
@@ -44,7 +44,8 @@ int facesWithTwoRimEdges(const Mesh& M, int k) {
   for (const auto& z : M.tets)
     for (int i = 0; i < 4; ++i) {
       const Face f = shapes::faceOf(z, i);
-      const int rim = SM.isRimEdge(f[0], f[1]) + SM.isRimEdge(f[1], f[2]) + SM.isRimEdge(f[2], f[0]);
+      const int rim =
+          SM.isRimEdge(f[0], f[1]) + SM.isRimEdge(f[1], f[2]) + SM.isRimEdge(f[2], f[0]);
       if (rim > 1) found.insert(f);
     }
   return static_cast<int>(found.size());
@@ -71,8 +72,8 @@ int edgesBetweenSurfaces(const Mesh& M, int k) {
   return static_cast<int>(found.size());
 }
 
-/// Full subcomplex: edges with both ends on S_M that are none of its, and faces with all nodes on S_M that
-/// are none of its.
+/// Full subcomplex: edges with both ends on S_M that are none of its, and faces with all nodes on
+/// S_M that are none of its.
 int chords(const Mesh& M, int k) {
   const SurfaceSets SM(M, k);
   std::set<Edge> edges;
@@ -80,10 +81,12 @@ int chords(const Mesh& M, int k) {
   for (const auto& z : M.tets)
     for (int i = 0; i < 4; ++i) {
       for (int j = 0; j < i; ++j)
-        if (SM.nodes.count(z[i]) && SM.nodes.count(z[j]) && !SM.edges.count(shapes::sortedEdge(z[i], z[j])))
+        if (SM.nodes.count(z[i]) && SM.nodes.count(z[j]) &&
+            !SM.edges.count(shapes::sortedEdge(z[i], z[j])))
           edges.insert(shapes::sortedEdge(z[i], z[j]));
       const Face f = shapes::faceOf(z, i);
-      if (SM.nodes.count(f[0]) && SM.nodes.count(f[1]) && SM.nodes.count(f[2]) && !SM.faces.count(f))
+      if (SM.nodes.count(f[0]) && SM.nodes.count(f[1]) && SM.nodes.count(f[2]) &&
+          !SM.faces.count(f))
         faces.insert(f);
     }
   return static_cast<int>(edges.size() + faces.size());
@@ -96,10 +99,12 @@ Mesh cubes(int n) { return boxMesh({0, 0, 0}, {double(n), double(n), double(n)},
 
 /// Labels the faces in a flat box of the computational space as surface 1.
 void label(Mesh& M, Vec3 low, Vec3 high) {
-  shapes::labelFaces(M, 1, [&](Vec3 a, Vec3 b, Vec3 c) { return shapes::facesInBox(a, b, c, low, high); });
+  shapes::labelFaces(
+      M, 1, [&](Vec3 a, Vec3 b, Vec3 c) { return shapes::facesInBox(a, b, c, low, high); });
 }
 
-/// Three squares around the node (2, 2, 2) in the plane z = 2; the missing one is where x > 2, and y > 2 or < 2.
+/// Three squares around the node (2, 2, 2) in the plane z = 2; the missing one is where x > 2, and
+/// y > 2 or < 2.
 Mesh threeSquares(bool missingAbove) {
   Mesh M = cubes(4);
   label(M, {1, 1, 2}, {2, 3, 2});
@@ -107,8 +112,8 @@ Mesh threeSquares(bool missingAbove) {
   return M;
 }
 
-/// Applies a case to M; it must change something, keep the mesh sound and S_M's area and topology, and do
-/// nothing the second time.
+/// Applies a case to M; it must change something, keep the mesh sound and S_M's area and topology,
+/// and do nothing the second time.
 void applyCase(Mesh& M, const std::function<bool(Bisection&, int)>& rule) {
   const double area = shapes::computationalArea(M, 1), volume = shapes::totalVolume(M);
   const bool disk = shapes::isDisk(surfaceFaces(M, 1));
@@ -219,7 +224,8 @@ TEST_SUITE("3.5") {
   TEST_CASE("case 2: the square between the two rim edges at a rim node with five triangles") {
     const Slab slab(4);
     const int n = nodeAt(slab.M, {3, 3, 2});  // the middle of the top
-    // Kuhn's diagonals end at n in the squares at (+,+) and (-,-): without one of the others five triangles
+    // Kuhn's diagonals end at n in the squares at (+,+) and (-,-): without one of the others five
+    // triangles
     Selection selected = slab.select({"....", ".##.", ".#..", "...."});
     CHECK(trianglesAt(slab, selected, n) == 5);
     CHECK(fillHighConnectivityNodes(slab.M, slab.Q, selected));
@@ -247,15 +253,18 @@ TEST_SUITE("3.5") {
       for (auto& row : rows)
         for (char& c : row) c = random.between(0, 1) < .7 ? '#' : '.';
       Selection selected = slab.select(rows);
-      for (int round = 0; round < 30 && fillHighConnectivityNodes(slab.M, slab.Q, selected); ++round) {
+      for (int round = 0; round < 30 && fillHighConnectivityNodes(slab.M, slab.Q, selected);
+           ++round) {
       }
       CHECK_FALSE(fillHighConnectivityNodes(slab.M, slab.Q, selected));
       for (int x = 2; x <= 5; ++x)
         for (int y = 2; y <= 5; ++y) {
-          const int chosen[4] = {slab.top(x - 2, y - 2), slab.top(x - 1, y - 2), slab.top(x - 1, y - 1), slab.top(x - 2, y - 1)};
+          const int chosen[4] = {slab.top(x - 2, y - 2), slab.top(x - 1, y - 2),
+                                 slab.top(x - 1, y - 1), slab.top(x - 2, y - 1)};
           int count = 0;
           for (int q : chosen) count += selected[q] != 0;
-          if (count == 3) CHECK(trianglesAt(slab, selected, nodeAt(slab.M, {double(x), double(y), 2})) < 5);
+          if (count == 3)
+            CHECK(trianglesAt(slab, selected, nodeAt(slab.M, {double(x), double(y), 2})) < 5);
         }
     }
   }
@@ -334,14 +343,17 @@ TEST_SUITE("3.5") {
     Bisection none(M);
     CHECK(edgesBetweenSurfaces(M, 1) == 0);
     CHECK_FALSE(refineEdgesBetweenSurfaces(none, 1));
-    // surface 2, one cube above, its nodes as projection leaves them: of dimension 2 on its own plane
+    // surface 2, one cube above, its nodes as projection leaves them: of dimension 2 on its own
+    // plane
     Parametrization plane;
     plane.points = {{1, 1, 4}, {5, 1, 4}, {5, 5, 4}, {1, 5, 4}};
     plane.triangles = {{0, 1, 2}, {0, 2, 3}};
     plane.u = {{0, 0}, {1, 0}, {1, 1}, {0, 1}};
     buildLocator(plane);
     M.surfaces = {plane, plane};
-    shapes::labelFaces(M, 2, [](Vec3 a, Vec3 b, Vec3 c) { return shapes::facesInBox(a, b, c, {2, 2, 4}, {4, 4, 4}); });
+    shapes::labelFaces(M, 2, [](Vec3 a, Vec3 b, Vec3 c) {
+      return shapes::facesInBox(a, b, c, {2, 2, 4}, {4, 4, 4});
+    });
     for (const Face& f : surfaceFaces(M, 2))
       for (int n : f) {
         M.dimension[n] = 2, M.entity[n] = 2;
@@ -371,7 +383,8 @@ TEST_SUITE("3.5") {
     const Face hole = surfaceFaces(M, 1)[3];
     for (std::size_t E = 0; E < M.tets.size(); ++E)  // one triangle out of the sheet
       for (int i = 0; i < 4; ++i)
-        if (shapes::faceOf(M.tets[E], i) == shapes::sortedFace(hole[0], hole[1], hole[2])) M.faceLabel[E][i] = 0;
+        if (shapes::faceOf(M.tets[E], i) == shapes::sortedFace(hole[0], hole[1], hole[2]))
+          M.faceLabel[E][i] = 0;
     CHECK(surfaceFaces(M, 1).size() == 7);
     const Face face = shapes::sortedFace(hole[0], hole[1], hole[2]);
     auto isFace = [&] {
@@ -388,13 +401,15 @@ TEST_SUITE("3.5") {
     CHECK(shapes::conformityFault(M) == "");
   }
 
-  TEST_CASE("healing: a hole with corners of 45 degrees is split for ever: refused after 30 rounds") {
+  TEST_CASE(
+      "healing: a hole with corners of 45 degrees is split for ever: refused after 30 rounds") {
     Mesh M = cubes(4);
     label(M, {1, 1, 2}, {3, 3, 2});
     const Face hole = surfaceFaces(M, 1)[3];
     for (std::size_t E = 0; E < M.tets.size(); ++E)
       for (int i = 0; i < 4; ++i)
-        if (shapes::faceOf(M.tets[E], i) == shapes::sortedFace(hole[0], hole[1], hole[2])) M.faceLabel[E][i] = 0;
+        if (shapes::faceOf(M.tets[E], i) == shapes::sortedFace(hole[0], hole[1], hole[2]))
+          M.faceLabel[E][i] = 0;
     Bisection B(M);
     CHECK_THROWS_AS(surfaceHealing(B, 1), MethodError);
   }
@@ -407,9 +422,12 @@ TEST_SUITE("3.5") {
     CHECK_FALSE(refineToFullSubcomplex(B, 1));
   }
 
-  TEST_CASE("healing: cases 3 to 6 and the full subcomplex on extracted surfaces, and nothing the second time") {
-    const TriangleSurface surfaces[] = {samples::sine(.1, 32), samples::randomPatch(1), samples::randomPatch(2),
-                                        samples::randomPatch(3), samples::plane(45, 45)};
+  TEST_CASE(
+      "healing: cases 3 to 6 and the full subcomplex on extracted surfaces, and nothing the second "
+      "time") {
+    const TriangleSurface surfaces[] = {samples::sine(.1, 32), samples::randomPatch(1),
+                                        samples::randomPatch(2), samples::randomPatch(3),
+                                        samples::plane(45, 45)};
     for (const TriangleSurface& S : surfaces)
       for (Outline outline : {Outline::paper, Outline::halfSquares}) {
         CAPTURE(S.name);
@@ -437,7 +455,9 @@ TEST_SUITE("3.5") {
       }
   }
 
-  TEST_CASE("healing: each case alone on extracted surfaces leaves none, and does nothing the second time") {
+  TEST_CASE(
+      "healing: each case alone on extracted surfaces leaves none, and does nothing the second "
+      "time") {
     const struct {
       const char* what;
       bool (*rule)(Bisection&, int);

@@ -1,7 +1,5 @@
 // SPDX-License-Identifier: MIT
 // §3.6: the linear solver, Floater's parameterization, and the projection of S_M onto S.
-#include "../meccano.hpp"
-
 #include <doctest/doctest.h>
 
 #include <algorithm>
@@ -10,6 +8,7 @@
 #include <utility>
 #include <vector>
 
+#include "../meccano.hpp"
 #include "shapes.hpp"
 
 using namespace meccano;
@@ -259,8 +258,10 @@ TEST_SUITE("3.6") {
               doctest::Approx(literalWeight(S, i, lambda.column[k])).epsilon(1e-9));
         sum += lambda.value[k];
       }
-      if (isRim[i]) CHECK(lambda.start[i] == lambda.start[i + 1]);
-      else CHECK(sum == doctest::Approx(1).epsilon(1e-14));
+      if (isRim[i])
+        CHECK(lambda.start[i] == lambda.start[i + 1]);
+      else
+        CHECK(sum == doctest::Approx(1).epsilon(1e-14));
     }
   }
 

@@ -151,9 +151,12 @@ TEST_SUITE("3.7.3") {
   TEST_CASE("eq. (10), (11): the sides of a tangled box stay unfolded in every sweep") {
     Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
     unsigned random = 7;
-    auto shake = [&] { return .9 * ((random = random * 1664525u + 1013904223u) / 4294967296. - .5); };
+    auto shake = [&] {
+      return .9 * ((random = random * 1664525u + 1013904223u) / 4294967296. - .5);
+    };
     for (std::size_t n = 0; n < M.x.size(); ++n)
-      if (M.dimension[n] == 3) M.x[n] += Vec3{shake(), shake(), shake()};  // up to 1.8 cells: tangled
+      if (M.dimension[n] == 3)
+        M.x[n] += Vec3{shake(), shake(), shake()};  // up to 1.8 cells: tangled
     CHECK(shapes::countInverted(M) > 0);
     OptimizeOptions options;
     options.onSweep = [&](const Sweep&) {

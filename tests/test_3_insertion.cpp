@@ -65,11 +65,13 @@ void checkPromises(const Mesh& before, const Mesh& M, const TriangleSurface& S, 
   int moved = 0, renamed = 0;
   for (std::size_t n = 0; n < before.x.size(); ++n) {
     moved += !(M.xi[n] == before.xi[n]);
-    renamed += before.dimension[n] < 3 && (M.dimension[n] != before.dimension[n] || M.entity[n] != before.entity[n]);
+    renamed += before.dimension[n] < 3 &&
+               (M.dimension[n] != before.dimension[n] || M.entity[n] != before.entity[n]);
   }
   CHECK(moved == 0);
   CHECK(renamed == 0);
-  // computational coordinates of new nodes: the lattice, where Kuhn's tetrahedra have volume 2^-level / 6
+  // computational coordinates of new nodes: the lattice, where Kuhn's tetrahedra have volume
+  // 2^-level / 6
   int wrong = 0;
   for (std::size_t E = 0; E < M.tets.size(); ++E) {
     const auto& z = M.tets[E];
@@ -119,7 +121,8 @@ void checkPromises(const Mesh& before, const Mesh& M, const TriangleSurface& S, 
 void insertAndCheck(const Mesh& before, const TriangleSurface& S, const InsertOptions& options) {
   Mesh M = before;
   const InsertReport report = insertSurface(M, S, options);
-  checkPromises(before, M, S, static_cast<int>(before.surfaces.size()) + 1, report, 1e-12 * shapes::diagonal(S));
+  checkPromises(before, M, S, static_cast<int>(before.surfaces.size()) + 1, report,
+                1e-12 * shapes::diagonal(S));
 }
 
 /// What insertSurface throws; the mesh must be what it was, byte for byte.
@@ -139,7 +142,9 @@ std::string refusal(Mesh& M, const TriangleSurface& S, const InsertOptions& opti
   return text;
 }
 
-bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+bool has(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
 
 TriangleSurface sheetAt(Vec3 c, double half, double bend) {
   return samples::sheet(8, 8, [=](double s, double t) {
@@ -151,6 +156,27 @@ TriangleSurface sheetAt(Vec3 c, double half, double bend) {
 TriangleSurface placed(TriangleSurface S, Vec3 origin, double size) {
   for (Vec3& p : S.points) p = origin + size * p;
   return S;
+}
+
+/// The faces of surface 1, seen from both sides of z = .5 + A sin 2 pi x: how many are clockwise in
+/// U, and how many are not. A folded face turns the other way.
+std::array<int, 2> turnsInU(const Mesh& M, double A) {
+  constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+  std::array<int, 2> turns{0, 0};
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i) {
+      if (M.faceLabel[E][i] != 1) continue;
+      const std::array<int, 4>& z = M.tets[E];
+      Vec2 u[3];
+      for (int k = 0; k < 3; ++k) REQUIRE(parameterOn(M, z[outward[i][k]], 1, u[k]));
+      const double volume =
+          det(Mat3{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]});
+      const Vec3 middle = .25 * (M.x[z[0]] + M.x[z[1]] + M.x[z[2]] + M.x[z[3]]);
+      const bool above = middle.z > .5 + A * std::sin(2 * std::acos(-1.) * middle.x);
+      const double area = (volume > 0 ? 1 : -1) * cross(u[1] - u[0], u[2] - u[0]);
+      ++turns[(area > 0) == above];  // all faces turn one way, seen from one side of S
+    }
+  return turns;
 }
 
 }  // namespace
@@ -175,7 +201,8 @@ TEST_SUITE("3") {
     CHECK(M.tets.size() >= 4000);
     CHECK(M.tets.size() <= 8000);
     CHECK(report.warnings.empty());
-    CHECK(stages == std::vector<std::string>{"approximated", "healed", "extracted", "surfaceHealed", "projected", "smoothed"});
+    CHECK(stages == std::vector<std::string>{"approximated", "healed", "extracted", "surfaceHealed",
+                                             "projected", "smoothed"});
     REQUIRE(at.size() == 6);
     CHECK(at[3].mean == report.refined.mean);
     CHECK(at[3].tetrahedra == report.refined.tetrahedra);
@@ -226,23 +253,32 @@ TEST_SUITE("3") {
       for (const InsertOptions& options : {withSize(.12), withSize(.12, InsertOptions::paper())}) {
         Mesh M = unitBox();
         insertSurface(M, samples::sine(A, 24), options);
-        int turns[2] = {0, 0};
-        for (std::size_t E = 0; E < M.tets.size(); ++E)
-          for (int i = 0; i < 4; ++i) {
-            if (M.faceLabel[E][i] != 1) continue;
-            constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
-            const std::array<int, 4>& z = M.tets[E];
-            Vec2 u[3];
-            for (int k = 0; k < 3; ++k) REQUIRE(parameterOn(M, z[outward[i][k]], 1, u[k]));
-            const double volume = det(Mat3{M.xi[z[1]] - M.xi[z[0]], M.xi[z[2]] - M.xi[z[0]], M.xi[z[3]] - M.xi[z[0]]});
-            const Vec3 middle = .25 * (M.x[z[0]] + M.x[z[1]] + M.x[z[2]] + M.x[z[3]]);
-            const bool above = middle.z > .5 + A * std::sin(2 * std::acos(-1.) * middle.x);
-            const double area = (volume > 0 ? 1 : -1) * cross(u[1] - u[0], u[2] - u[0]);
-            ++turns[(area > 0) == above];  // all faces turn one way, seen from one side of S
-          }
+        const std::array<int, 2> turns = turnsInU(M, A);
         CHECK(std::min(turns[0], turns[1]) == 0);
         CHECK(std::max(turns[0], turns[1]) > 200);
       }
+  }
+
+  TEST_CASE("optimization: triangles of S_M that start folded in U come right") {
+    Mesh M = unitBox();
+    insertSurface(M, samples::sine(.1, 24), withSize(.12));
+    // the inner nodes nearest to four places are moved past their neighbours along S
+    for (const Vec2 middle : {Vec2{.3, .3}, Vec2{.3, .7}, Vec2{.7, .3}, Vec2{.7, .7}}) {
+      int folded = -1;
+      const auto away = [&](int n) { return norm(M.parameter[n] - middle); };
+      for (int n = 0; n < static_cast<int>(M.x.size()); ++n)
+        if (M.dimension[n] == 2 && M.entity[n] == 1 && (folded < 0 || away(n) < away(folded)))
+          folded = n;
+      REQUIRE(folded >= 0);
+      M.parameter[folded] = M.parameter[folded] + Vec2{.25, .25};
+      M.x[folded] = varphi(M.surfaces[0], M.parameter[folded]);
+    }
+    const std::array<int, 2> before = turnsInU(M, .1);
+    REQUIRE(std::min(before[0], before[1]) > 0);
+    REQUIRE(shapes::countInverted(M) > 0);
+    CHECK(optimizeMesh(M).inverted == 0);
+    const std::array<int, 2> after = turnsInU(M, .1);
+    CHECK(std::min(after[0], after[1]) == 0);
   }
 
   TEST_CASE("insertion: S turned over gives a valid mesh as well") {
@@ -265,7 +301,8 @@ TEST_SUITE("3") {
     insertAndCheck(unitBox(), S, withSize(.14));
   }
 
-  TEST_CASE("insertion: a surface of a single triangle") {  // its rim has three points: splitChords() adds some
+  TEST_CASE("insertion: a surface of a single triangle") {  // its rim has three points:
+                                                            // splitChords() adds some
     TriangleSurface S;
     S.points = {{.3, .3, .45}, {.7, .32, .5}, {.68, .7, .55}};
     S.triangles = {{0, 1, 2}};
@@ -274,7 +311,8 @@ TEST_SUITE("3") {
 
   TEST_CASE("insertion: a ribbon narrower than the cubes is covered by S_M, or refused") {
     const TriangleSurface S = samples::sheet(40, 6, [](double s, double t) {
-      return samples::turned(Vec3{.3 * s, .01 * t, .03 * std::sin(4 * s)}, 1, 8) + Vec3{.47, .46, .52};
+      return samples::turned(Vec3{.3 * s, .01 * t, .03 * std::sin(4 * s)}, 1, 8) +
+             Vec3{.47, .46, .52};
     });
     const Mesh before = unitBox();
     Mesh M = before;
@@ -287,7 +325,9 @@ TEST_SUITE("3") {
     }
   }
 
-  TEST_CASE("insertion: far from the origin and in other units, nodes on S to the coordinates' last digits") {
+  TEST_CASE(
+      "insertion: far from the origin and in other units, nodes on S to the coordinates' last "
+      "digits") {
     const Vec3 origin{4e6, -3e6, 2e6};
     const double size = 1000;
     const TriangleSurface S = placed(samples::sine(.1, 24), origin, size);
@@ -355,7 +395,8 @@ TEST_SUITE("3") {
     Mesh M = unitBox();
     const TriangleSurface S = samples::sine(.1, 24);
     InsertOptions options;
-    for (double E : {-1., std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {
+    for (double E :
+         {-1., std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {
       options.tolerance = E;
       CHECK(has(refusal(M, S, options, true), "tolerance"));
     }
@@ -371,7 +412,8 @@ TEST_SUITE("3") {
 
   TEST_CASE("insertion: a second surface far from the first") {
     Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
-    const TriangleSurface low = sheetAt({.5, .5, .25}, .2, .03), high = sheetAt({.5, .5, .74}, .2, -.03);
+    const TriangleSurface low = sheetAt({.5, .5, .25}, .2, .03),
+                          high = sheetAt({.5, .5, .74}, .2, -.03);
     insertSurface(M, low, withSize(.12));
     const Mesh before = M;
     const InsertReport report = insertSurface(M, high, withSize(.12));
@@ -382,7 +424,9 @@ TEST_SUITE("3") {
     CHECK(M.curves.size() == before.curves.size() + 1);
   }
 
-  TEST_CASE("insertion: a second surface through or close to the first is refused or keeps the promises") {
+  TEST_CASE(
+      "insertion: a second surface through or close to the first is refused or keeps the "
+      "promises") {
     for (double z : {.30, .25}) {
       CAPTURE(z);
       Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {4, 4, 4});
@@ -415,53 +459,60 @@ TEST_SUITE("3") {
     const struct {
       const char* what;
       TriangleSurface S;
-    } tries[] = {
-        {"empty", TriangleSurface()},
-        {"no triangles", changed([](TriangleSurface& S) { S.triangles.clear(); })},
-        {"only zero area", changed([](TriangleSurface& S) { S.triangles = {{0, 1, 1}, {0, 1, 2}}; })},
-        {"index", changed([](TriangleSurface& S) { S.triangles[3][1] = 1000; })},
-        {"negative index", changed([](TriangleSurface& S) { S.triangles[3][1] = -1; })},
-        {"not a number", changed([&](TriangleSurface& S) { S.points[7].y = nan; })},
-        {"infinite", changed([](TriangleSurface& S) { S.points[7].z = std::numeric_limits<double>::infinity(); })},
-        {"three at an edge", changed([&](TriangleSurface& S) {
-           S.points.push_back({.5, .5, .8});
-           S.triangles.push_back({6, 7, static_cast<int>(last)});
-           S.triangles.push_back({7, 12, static_cast<int>(last)});
-         })},
-        {"two parts", changed([&](TriangleSurface& S) {
-           const int n = static_cast<int>(last);
-           S.points.insert(S.points.end(), {{.4, .4, .8}, {.5, .4, .8}, {.4, .5, .8}});
-           S.triangles.push_back({n, n + 1, n + 2});
-         })},
-        {"a hole", changed([](TriangleSurface& S) { S.triangles.erase(S.triangles.begin() + 11); })},
-        {"meet at a point", changed([&](TriangleSurface& S) {
-           const int n = static_cast<int>(last);
-           S.points.insert(S.points.end(), {{.1, .1, .5}, {.1, .2, .5}});
-           S.triangles.push_back({0, n, n + 1});
-         })},
-        {"closed", [] {
-           TriangleSurface S;
-           S.points = {{.4, .4, .4}, {.6, .4, .4}, {.4, .6, .4}, {.4, .4, .6}};
-           S.triangles = {{0, 2, 1}, {0, 1, 3}, {1, 2, 3}, {0, 3, 2}};
-           return S;
-         }()},
-        {"a Moebius band", [] {
-           TriangleSurface S;
-           constexpr int n = 20;
-           for (int i = 0; i < n; ++i) {
-             const double a = 2 * samples::pi * i / n;
-             for (double r : {-.06, .06}) {
-               const double out = .25 + r * std::cos(a / 2);
-               S.points.push_back({.5 + out * std::cos(a), .5 + out * std::sin(a), .5 + r * std::sin(a / 2)});
-             }
-           }
-           for (int i = 0; i < n; ++i) {
-             const int a = 2 * i, b = a + 1, c = i + 1 < n ? a + 2 : 1, d = i + 1 < n ? a + 3 : 0;
-             S.triangles.push_back({a, c, b});
-             S.triangles.push_back({b, c, d});
-           }
-           return S;
-         }()}};
+    } tries[] = {{"empty", TriangleSurface()},
+                 {"no triangles", changed([](TriangleSurface& S) { S.triangles.clear(); })},
+                 {"only zero area", changed([](TriangleSurface& S) {
+                    S.triangles = {{0, 1, 1}, {0, 1, 2}};
+                  })},
+                 {"index", changed([](TriangleSurface& S) { S.triangles[3][1] = 1000; })},
+                 {"negative index", changed([](TriangleSurface& S) { S.triangles[3][1] = -1; })},
+                 {"not a number", changed([&](TriangleSurface& S) { S.points[7].y = nan; })},
+                 {"infinite", changed([](TriangleSurface& S) {
+                    S.points[7].z = std::numeric_limits<double>::infinity();
+                  })},
+                 {"three at an edge", changed([&](TriangleSurface& S) {
+                    S.points.push_back({.5, .5, .8});
+                    S.triangles.push_back({6, 7, static_cast<int>(last)});
+                    S.triangles.push_back({7, 12, static_cast<int>(last)});
+                  })},
+                 {"two parts", changed([&](TriangleSurface& S) {
+                    const int n = static_cast<int>(last);
+                    S.points.insert(S.points.end(), {{.4, .4, .8}, {.5, .4, .8}, {.4, .5, .8}});
+                    S.triangles.push_back({n, n + 1, n + 2});
+                  })},
+                 {"a hole",
+                  changed([](TriangleSurface& S) { S.triangles.erase(S.triangles.begin() + 11); })},
+                 {"meet at a point", changed([&](TriangleSurface& S) {
+                    const int n = static_cast<int>(last);
+                    S.points.insert(S.points.end(), {{.1, .1, .5}, {.1, .2, .5}});
+                    S.triangles.push_back({0, n, n + 1});
+                  })},
+                 {"closed",
+                  [] {
+                    TriangleSurface S;
+                    S.points = {{.4, .4, .4}, {.6, .4, .4}, {.4, .6, .4}, {.4, .4, .6}};
+                    S.triangles = {{0, 2, 1}, {0, 1, 3}, {1, 2, 3}, {0, 3, 2}};
+                    return S;
+                  }()},
+                 {"a Moebius band", [] {
+                    TriangleSurface S;
+                    constexpr int n = 20;
+                    for (int i = 0; i < n; ++i) {
+                      const double a = 2 * samples::pi * i / n;
+                      for (double r : {-.06, .06}) {
+                        const double out = .25 + r * std::cos(a / 2);
+                        S.points.push_back({.5 + out * std::cos(a), .5 + out * std::sin(a),
+                                            .5 + r * std::sin(a / 2)});
+                      }
+                    }
+                    for (int i = 0; i < n; ++i) {
+                      const int a = 2 * i, b = a + 1, c = i + 1 < n ? a + 2 : 1,
+                                d = i + 1 < n ? a + 3 : 0;
+                      S.triangles.push_back({a, c, b});
+                      S.triangles.push_back({b, c, d});
+                    }
+                    return S;
+                  }()}};
     for (const auto& t : tries) {
       CAPTURE(t.what);
       Mesh M = unitBox();
@@ -496,7 +547,8 @@ TEST_SUITE("3") {
     CHECK(refusal(nodeless, S, withSize(.14), true) != "");
   }
 
-  TEST_CASE("failure: a host's mesh with indices or numbers out of range is refused, not followed") {
+  TEST_CASE(
+      "failure: a host's mesh with indices or numbers out of range is refused, not followed") {
     const TriangleSurface S = samples::sine(.1, 8);
     auto refused = [&](const std::function<void(Mesh&)>& spoil, const char* word) {
       Mesh M = unitBox();
@@ -513,15 +565,19 @@ TEST_SUITE("3") {
     refused([](Mesh& M) { M.patches.clear(); }, "out of range");
     refused([](Mesh& M) { M.corners[0].on[0].curve = 13; }, "curve");
     refused([](Mesh& M) { M.x[13].y = HUGE_VAL; }, "node 13");
-    refused([](Mesh& M) { for (Vec3& xi : M.xi) xi.z -= 1; }, "out of range");
-    for (double edge : {1e200, -.5, 0.})
-      refused([&](Mesh& M) { M.cube = {edge, .5, .5}; }, "cube");
+    refused(
+        [](Mesh& M) {
+          for (Vec3& xi : M.xi) xi.z -= 1;
+        },
+        "out of range");
+    for (double edge : {1e200, -.5, 0.}) refused([&](Mesh& M) { M.cube = {edge, .5, .5}; }, "cube");
   }
 
   TEST_CASE("failure: options out of range leave the mesh as it was") {
     const TriangleSurface S = samples::sine(.1, 16);
     Mesh M = unitBox();
-    for (double lc : {-.1, .5, 1e-6, std::nan("")}) CHECK(has(refusal(M, S, withSize(lc), true), "l_c"));
+    for (double lc : {-.1, .5, 1e-6, std::nan("")})
+      CHECK(has(refusal(M, S, withSize(lc), true), "l_c"));
     InsertOptions small = withSize(.12);
     small.maxTets = 100;
     CHECK(has(refusal(M, S, small, true), "limit"));
@@ -560,7 +616,8 @@ TEST_SUITE("3") {
   }
 
   TEST_CASE("failure: an exception of the host's own callback leaves the mesh as it was") {
-    for (const char* name : {"approximated", "healed", "extracted", "surfaceHealed", "projected", "smoothed"}) {
+    for (const char* name :
+         {"approximated", "healed", "extracted", "surfaceHealed", "projected", "smoothed"}) {
       Mesh M = unitBox();
       const Mesh before = M;
       InsertOptions options = withSize(.14);

@@ -96,7 +96,8 @@ TriangleSurface together(const TriangleSurface& A, const TriangleSurface& B) {
 }  // namespace
 
 TEST_SUITE("4.2") {
-  TEST_CASE("sets: three surfaces in one call: the largest first, in whichever order they are listed") {
+  TEST_CASE(
+      "sets: three surfaces in one call: the largest first, in whichever order they are listed") {
     std::vector<TriangleSurface> S{sheetAt({.45, .5, .3}, .2, .03, "large"),
                                    sheetAt({.55, .5, .52}, .18, -.03, "middle"),
                                    sheetAt({.5, .5, .72}, .15, .02, "small")};

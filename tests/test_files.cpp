@@ -160,7 +160,9 @@ TEST_SUITE("files") {
 
   TEST_CASE("OBJ: one broken file per rule, each with its line") {
     const std::string three = "v 0 0 0\nv 1 0 0\nv 0 1 0\n";
-    struct Rule { std::string text, place, what; };
+    struct Rule {
+      std::string text, place, what;
+    };
     const Rule rules[] = {{"", "s.obj: ", "empty"},
                           {" \r\n\n", "s.obj: ", "empty"},
                           {"v 0 0\n", "s.obj:1: ", "three coordinates"},
@@ -285,7 +287,9 @@ TEST_SUITE("files") {
 
   TEST_CASE("VTK: one broken file per rule") {
     const std::string text = vtkText(boxMesh({0, 0, 0}, {1, 1, 1}, {1, 1, 1}));
-    struct Rule { std::string from, to, what; };
+    struct Rule {
+      std::string from, to, what;
+    };
     const Rule rules[] = {
         {"# vtk DataFile", "solid", "no VTK legacy file"},
         {"ASCII", "TEXT", "'TEXT' is where ASCII should be"},
@@ -380,8 +384,7 @@ TEST_SUITE("files") {
                        "CELLS 2 4\nOFFSETS vtktypeint64\n4 0\n"),
               "the offsets do not grow from 0 to 4"));
     // a list named as the labels are, with one entry for three cells
-    const Mesh M =
-        parseVtk("m.vtk", two + "CELL_DATA 3\nFIELD FieldData 1\nsurface 1 1 int\n1\n");
+    const Mesh M = parseVtk("m.vtk", two + "CELL_DATA 3\nFIELD FieldData 1\nsurface 1 1 int\n1\n");
     CHECK(M.faceLabel.empty());
   }
 
@@ -396,16 +399,16 @@ TEST_SUITE("files") {
   }
 
   TEST_CASE("VTK: version 5 as ParaView writes it: offsets, attributes, strings, metadata") {
-    const Mesh M = parseVtk(
-        "m.vtk",
-        "# vtk DataFile Version 5.1\nvtk output\nASCII\nDATASET UNSTRUCTURED_GRID\n"
-        "FIELD FieldData 1\nnotes 1 2 string\nfirst%20note with words\nPOINTS\n"
-        "POINTS 4 float\n0 0 0 1 0 0 0 1 0 \n0 0 1 \n"
-        "CELLS 2 4\nOFFSETS vtktypeint64\n0 4 \nCONNECTIVITY vtktypeint64\n0 1 2 3 \n\n"
-        "CELL_TYPES 1\n10\n\nPOINT_DATA 4\nSCALARS h float\nLOOKUP_TABLE t\n0 1 2 3 \n"
-        "LOOKUP_TABLE t 2\n0 0 0 1\n1 1 1 1\nNORMALS n float\n0 0 1 0 0 1 0 0 1 0 0 1\n"
-        "METADATA\nINFORMATION 0\n\nCELL_DATA 1\nCOLOR_SCALARS c 3\n.1 .2 .3\n"
-        "TEXTURE_COORDINATES t 2 float\n0 0\nFIELD FieldData 1\nq 1 1 double\n1\n");
+    const Mesh M =
+        parseVtk("m.vtk",
+                 "# vtk DataFile Version 5.1\nvtk output\nASCII\nDATASET UNSTRUCTURED_GRID\n"
+                 "FIELD FieldData 1\nnotes 1 2 string\nfirst%20note with words\nPOINTS\n"
+                 "POINTS 4 float\n0 0 0 1 0 0 0 1 0 \n0 0 1 \n"
+                 "CELLS 2 4\nOFFSETS vtktypeint64\n0 4 \nCONNECTIVITY vtktypeint64\n0 1 2 3 \n\n"
+                 "CELL_TYPES 1\n10\n\nPOINT_DATA 4\nSCALARS h float\nLOOKUP_TABLE t\n0 1 2 3 \n"
+                 "LOOKUP_TABLE t 2\n0 0 0 1\n1 1 1 1\nNORMALS n float\n0 0 1 0 0 1 0 0 1 0 0 1\n"
+                 "METADATA\nINFORMATION 0\n\nCELL_DATA 1\nCOLOR_SCALARS c 3\n.1 .2 .3\n"
+                 "TEXTURE_COORDINATES t 2 float\n0 0\nFIELD FieldData 1\nq 1 1 double\n1\n");
     CHECK(M.x.size() == 4);
     CHECK(M.tets.size() == 1);
   }
@@ -962,18 +965,32 @@ TEST_SUITE("command line") {
     CHECK(call({"stats", mesh}).status == 0);
     CHECK(call({"stats", folder / "none.vtk"}).status == 1);
     const std::vector<std::vector<std::string>> wrong{
-        {}, {""}, {"bxo"}, {"--box"}, {"box"}, {"box", "-o"}, {"box", "-o", "--cells"},
-        {"box", "-o", mesh, "--cells", "2", "2"}, {"box", "-o", mesh, "--cells", "2", "2", "2.5"},
+        {},
+        {""},
+        {"bxo"},
+        {"--box"},
+        {"box"},
+        {"box", "-o"},
+        {"box", "-o", "--cells"},
+        {"box", "-o", mesh, "--cells", "2", "2"},
+        {"box", "-o", mesh, "--cells", "2", "2", "2.5"},
         {"box", "-o", mesh, "--size", "1", "1", "1m"},
         {"box", "-o", mesh, "--size", "1", "1", "inf"},
-        {"box", "-o", mesh, "extra"}, {"box", "-o", mesh, "--colour", "red"},
-        {"box", "-o", mesh, "-o", mesh}, {"box", "-o", folder / "m.obj"},
-        {"box", "-o", folder / "m"}, {"stats"},
-        {"convert", mesh}, {"convert", mesh, folder / "m.txt"}, {"optimize", mesh, "--ideal", mesh},
-        {"stats", mesh, mesh}, {"insert", mesh, "-o", mesh, "--lc", "1"},
+        {"box", "-o", mesh, "extra"},
+        {"box", "-o", mesh, "--colour", "red"},
+        {"box", "-o", mesh, "-o", mesh},
+        {"box", "-o", folder / "m.obj"},
+        {"box", "-o", folder / "m"},
+        {"stats"},
+        {"convert", mesh},
+        {"convert", mesh, folder / "m.txt"},
+        {"optimize", mesh, "--ideal", mesh},
+        {"stats", mesh, mesh},
+        {"insert", mesh, "-o", mesh, "--lc", "1"},
         {"insert", mesh, "s.obj", "--lc", "1"},
         {"insert", mesh, "s.obj", "-o", mesh, "--lc", "1", "--tolerance", "1"},
-        {"insert", mesh, "s.obj", "-o", mesh, "--lc", "0.1x"}, {"optimize", mesh}};
+        {"insert", mesh, "s.obj", "-o", mesh, "--lc", "0.1x"},
+        {"optimize", mesh}};
     for (const std::vector<std::string>& words : wrong) {
       CAPTURE(words.size());
       const Outcome o = call(words);
@@ -1266,9 +1283,10 @@ TEST_SUITE("command line") {
     const std::string out = folder / "cube.vtk";
     std::string corners;
     for (int n = 0; n < 8; ++n)
-      corners += format("corner %d %d %d  %d %d %d\n", n % 2, n / 2 % 2, n / 4, n % 2, n / 2 % 2,
-                        n / 4);
-    const auto refusal = [&](const std::string& file, const char* eps, const std::string& polycube) {
+      corners +=
+          format("corner %d %d %d  %d %d %d\n", n % 2, n / 2 % 2, n / 4, n % 2, n / 2 % 2, n / 4);
+    const auto refusal = [&](const std::string& file, const char* eps,
+                             const std::string& polycube) {
       std::vector<std::string> words{"solid", file, "--eps", eps, "-o", out, "--max-tets", "9000"};
       if (!polycube.empty())
         words.insert(words.end(), {"--polycube", folder.file("p.txt", polycube)});
@@ -1281,10 +1299,11 @@ TEST_SUITE("command line") {
     CHECK(has(refusal(folder.file("open.obj", cube + open), ".1", ""), "the surface is open"));
     // the zero-area triangle that closes it along an edge is dropped, and that is said
     const std::string flat = "v .5 0 0\nf 1 2 9\nf 1 9 6 5\nf 9 2 6\n";
-    const std::string needle = refusal(
-        folder.file("flat.obj", cube + flat + "f 1 3 4 2\nf 5 6 8 7\nf 3 7 8 4\nf 1 5 7 3\n"
-                                              "f 2 4 8 6\n"),
-        ".1", "");
+    const std::string needle =
+        refusal(folder.file("flat.obj", cube + flat +
+                                            "f 1 3 4 2\nf 5 6 8 7\nf 3 7 8 4\nf 1 5 7 3\n"
+                                            "f 2 4 8 6\n"),
+                ".1", "");
     CHECK(has(needle, "1 zero-area triangle"));
     CHECK(has(needle, "the surface is open"));
     for (const char* eps : {"0", "-1"}) CHECK(has(refusal(in, eps, ""), "must be above 0"));
