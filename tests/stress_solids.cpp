@@ -161,10 +161,11 @@ void measureDistances(const Mesh& M, const TriangleSurface& D, bool terrain, dou
 }
 
 /// The layers of a row, one call of insertSurface each.
-QualityStatistics insertLayers(const Row& row, const Terrain& T, Mesh& M) {
+QualityStatistics insertLayers(const Row& row, const Terrain& T, const MesherOptions& mesher,
+                               Mesh& M) {
   constexpr double lc = 660, margin = 2600;  // m; cells of 400 m
   InsertOptions options;
-  options.lc = lc, options.optimize.threads = 1;
+  options.lc = lc, options.optimize.threads = 1, options.onProgress = mesher.onProgress;
   QualityStatistics q;
   for (double height : row.layers.heights)
     q = insertSurface(M, samples::layer(samples::smoothed(T, row.layers.smoothed), height, margin),
@@ -212,7 +213,7 @@ Measured meshOf(Row& row, const stress::Arguments& a, Mesh& M) {
     m.q = meccanoMesher(M, row.D, options).smoothed;
   }
   const Mesh before = M;  // an insertion lets the ground's nodes slide without a bound
-  if (!row.layers.heights.empty()) m.q = insertLayers(row, T, M);
+  if (!row.layers.heights.empty()) m.q = insertLayers(row, T, options, M);
   m.seconds = static_cast<double>(std::clock() - start) / CLOCKS_PER_SEC;
   m.inverted = shapes::countInverted(M);
   measureDistances(before, row.D, row.top > 0, options.eps, m);
