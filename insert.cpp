@@ -3767,9 +3767,9 @@ void keepNearerOnEdge(Vec3 x, const std::array<Vec3, 3>& corner, int i, ClosestP
 
 /// Distance of two boxes, 0 where they meet; a point is a box too.
 double boxDistance(const TriangleTree::Box& a, const TriangleTree::Box& b) {
-  return norm(Vec3{std::max({a.lo.x - b.hi.x, b.lo.x - a.hi.x, 0.0}),
-                   std::max({a.lo.y - b.hi.y, b.lo.y - a.hi.y, 0.0}),
-                   std::max({a.lo.z - b.hi.z, b.lo.z - a.hi.z, 0.0})});
+  const Vec3 after = a.lo - b.hi, before = b.lo - a.hi;
+  return norm(Vec3{std::max(std::max(after.x, before.x), 0.), std::max(std::max(after.y, before.y), 0.),
+                   std::max(std::max(after.z, before.z), 0.)});
 }
 
 void growBox(TriangleTree::Box& box, Vec3 p) {
@@ -3832,15 +3832,18 @@ TriangleTree::Box boxOf(const std::array<Vec3, 3>& corners) {
 }
 
 ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
-  ClosestPoint best{beyondAll, a, 0, {1, 0, 0}, Feature::vertex, 0};
-  for (int i = 0; i < 3; ++i) keepNearerOnEdge(x, {a, b, c}, i, best);
-
-  // The foot of the perpendicular, where it is inside: w are the areas seen from it.
+  // The foot of the perpendicular: w are the areas seen from it. The nearest point lies on an edge
+  // only if the foot is beyond it (or so near that rounding decides; n = 0 gives no number).
+  constexpr double nearEdge = 1e-6;
   const Vec3 n = cross(b - a, c - a);
   const double n2 = norm2(n);
   const double w1 = dot(cross(x - a, c - a), n) / n2, w2 = dot(cross(b - a, x - a), n) / n2;
   const double w0 = 1 - w1 - w2;
-  if (!(w0 > 0 && w1 > 0 && w2 > 0)) return best;  // also where n = 0
+  ClosestPoint best{beyondAll, a, 0, {1, 0, 0}, Feature::vertex, 0};
+  if (!(w2 > nearEdge)) keepNearerOnEdge(x, {a, b, c}, 0, best);
+  if (!(w0 > nearEdge)) keepNearerOnEdge(x, {a, b, c}, 1, best);
+  if (!(w1 > nearEdge)) keepNearerOnEdge(x, {a, b, c}, 2, best);
+  if (!(w0 > 0 && w1 > 0 && w2 > 0)) return best;
   const Vec3 p = a + (w1 * (b - a) + w2 * (c - a));
   const double distance = norm(x - p);
   if (distance < best.distance) best = {distance, p, 0, {w0, w1, w2}, Feature::face, 0};
@@ -4016,15 +4019,21 @@ bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
   return false;
 }
 
-/// Whether x is not farther than this from the tree's triangles: the first one found so near will
-/// do.
-bool isWithin(const TriangleTree& tree, Vec3 x, double distance) {
+/// Whether x is not farther than this from triangle i (in tree order).
+bool isNear(const TriangleTree& tree, int i, Vec3 x, double distance) {
+  const std::array<Vec3, 3>& c = tree.corners[i];
+  return closestPointOnTriangle(x, c[0], c[1], c[2]).distance <= distance;
+}
+
+/// A triangle (in tree order) that is not farther than this from x, the first one found; -1: none.
+int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
+  if (tree.nodes.empty()) return -1;
   double bound = distance;  // −1 ends the search
+  int found = -1;
   visitNearest(tree, 0, boxDistance(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
-    const std::array<Vec3, 3>& c = tree.corners[i];
-    if (bound >= 0 && closestPointOnTriangle(x, c[0], c[1], c[2]).distance <= distance) bound = -1;
+    if (found < 0 && isNear(tree, i, x, distance)) found = i, bound = -1;
   });
-  return bound < 0;
+  return found;
 }
 
 /// Largest distance of points of A, a lattice of `least` steps on each triangle or of more that are
@@ -4032,13 +4041,20 @@ bool isWithin(const TriangleTree& tree, Vec3 x, double distance) {
 Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
                       Width largest = {0, {}}) {
   constexpr double mostSteps = 1000;
+  int last = 0;  // the triangle of B that was near: neighbours in A are so to the same
+  const auto isNearLast = [&](Vec3 p) { return isNear(B, last, p, largest.distance); };
   for (const std::array<Vec3, 3>& c : A.corners) {
+    // the distance from one triangle is a convex function: on another one largest at a corner
+    if (isNearLast(c[0]) && isNearLast(c[1]) && isNearLast(c[2])) continue;
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
     for (int i = 0; i <= m; ++i)
       for (int j = 0; i + j <= m; ++j) {
         const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
-        if (!isWithin(B, p, largest.distance)) largest = {B.closest(p).distance, p};
+        if (isNearLast(p)) continue;
+        const int near = triangleWithin(B, p, largest.distance);
+        if (near < 0) largest = {B.closest(p).distance, p};
+        if (near >= 0) last = near;
       }
   }
   return largest;
@@ -4943,10 +4959,14 @@ class RimRegularization {
   void run(bool halves) {
     constexpr int maxSweeps = 60;  // E falls in each: only a guard
     halves_ = halves;
+    awake_.assign(Q_.squares.size(), 1);
     for (int sweep = 0; sweep < maxSweeps; ++sweep) {
       bool improved = false;
-      for (int i = 0; i < static_cast<int>(Q_.squares.size()); ++i)
+      for (int i = 0; i < static_cast<int>(Q_.squares.size()); ++i) {
+        if (!awake_[i]) continue;
+        awake_[i] = 0;
         if (isNearRim(i)) improved |= improve(i);
+      }
       if (!improved) return;
     }
   }
@@ -5005,29 +5025,36 @@ class RimRegularization {
     return selected_[s.across[e]] >> s.acrossEdge[e] & 1;
   }
 
-  /// E and χ of what squares i and j (or i alone, j < 0) touch.
-  struct Local {
-    double E;
-    int chi;
-  };
-  Local local(int i, int j) const {
-    Local sum{0, 0};
+  /// E of what squares i and j (or i alone, j < 0) touch, or a part of it that reaches `enough`.
+  double localEnergy(int i, int j, double enough) const {
+    double E = 0;
+    for (int square : {i, j}) {
+      if (square < 0) continue;
+      E += squareEnergy(square);
+      for (int n : Q_.squares[square].node) {
+        if (E >= enough) return E;
+        if (square != j || !isCorner(i, n)) E += nodeEnergy(n);
+      }
+    }
+    return E;
+  }
+  /// χ of the same.
+  int localChi(int i, int j) const {
+    int chi = 0;
     for (int square : {i, j}) {
       if (square < 0) continue;
       const Square& s = Q_.squares[square];
-      sum.E += squareEnergy(square);
-      sum.chi += selected_[square] != 0;  // the centre
+      chi += selected_[square] != 0;  // the centre
       for (int e = 0; e < 4; ++e) {
         const int here = selected_[square] >> e & 1,
                   previous = selected_[square] >> ((e + 3) % 4) & 1;
-        sum.chi += here - (here || previous);  // quarter and spoke
-        if (square != j || s.across[e] != i) sum.chi -= here || quarterAcross(square, e);
+        chi += here - (here || previous);  // quarter and spoke
+        if (square != j || s.across[e] != i) chi -= here || quarterAcross(square, e);
         if (square == j && isCorner(i, s.node[e])) continue;
-        sum.E += nodeEnergy(s.node[e]);
-        sum.chi += nodeState(Q_, selected_, s.node[e]).quarters > 0;
+        chi += nodeState(Q_, selected_, s.node[e]).quarters > 0;
       }
     }
-    return sum;
+    return chi;
   }
   bool isCorner(int i, int n) const {
     const auto& nodes = Q_.squares[i].node;
@@ -5067,8 +5094,8 @@ class RimRegularization {
   bool tryStates(int i, int j) {
     constexpr double least = 1e-9;  // a fall of E below rounding is none
     const unsigned char oldI = selected_[i], oldJ = j < 0 ? emptySquare : selected_[j];
-    const Local before = local(i, j);
-    double bestE = before.E - least;
+    const int chi = localChi(i, j);
+    double bestE = localEnergy(i, j, beyondAll) - least;
     unsigned char bestI = oldI, bestJ = oldJ;
     const int count = halves_ ? 6 : 2;
     for (int a = 0; a < count; ++a) {
@@ -5077,65 +5104,82 @@ class RimRegularization {
         if (j >= 0 && !isAllowed(j, states_[b])) continue;
         selected_[i] = states_[a];
         if (j >= 0) selected_[j] = states_[b];
-        const Local now = local(i, j);
-        if (now.E < bestE && now.chi == before.chi && isClean(i) && (j < 0 || isClean(j)))
-          bestE = now.E, bestI = states_[a], bestJ = states_[b];
+        const double E = localEnergy(i, j, bestE);
+        if (E < bestE && localChi(i, j) == chi && isClean(i) && (j < 0 || isClean(j)))
+          bestE = E, bestI = states_[a], bestJ = states_[b];
       }
     }
     selected_[i] = bestI;
     if (j >= 0) selected_[j] = bestJ;
+    if (bestI != oldI) wakeAround(i);
+    if (j >= 0 && bestJ != oldJ) wakeAround(j);
     return bestI != oldI || (j >= 0 && bestJ != oldJ);
+  }
+
+  /// improve() looks at a square, a neighbour across its edge, that one's neighbours and theirs:
+  /// what three rings of squares around i decide may change with i.
+  void wakeAround(int i) {
+    std::vector<int> near{i};
+    for (int ring = 0; ring < 3; ++ring) {
+      std::vector<int> wider;
+      for (int square : near)
+        for (int n : Q_.squares[square].node)
+          for (int k = Q_.start[n]; k < Q_.start[n + 1]; ++k) wider.push_back(Q_.around[k].first);
+      std::sort(wider.begin(), wider.end());
+      wider.erase(std::unique(wider.begin(), wider.end()), wider.end());
+      near = std::move(wider);
+    }
+    for (int square : near) awake_[square] = 1;
   }
 
   const SquareSurface& Q_;
   const Survey& survey_;
   int side_;
   Selection& selected_;
+  std::vector<char> awake_ = {};  // [squares] 1: something near has changed since the last try
   bool halves_ = false;
 };
 
-/// 5000 × the area mean over S of max(0, dist(S, S_M)/h − 1.1)²: S must be near its approximation.
-double uncovered(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
-                 const Selection& selected) {
-  constexpr double weight = 5000, allowed = 1.1;
+/// The selected squares, each as two triangles.
+TriangleTree treeOf(const Mesh& M, const SquareSurface& Q, const Selection& selected) {
   std::vector<std::array<int, 3>> triangles;
-  for (std::size_t i = 0; i < selected.size(); ++i)
-    if (selected[i]) {
-      const auto& n = Q.squares[i].node;
-      triangles.push_back({n[0], n[1], n[2]});
-      triangles.push_back({n[0], n[2], n[3]});
-    }
-  const TriangleTree tree(M.x, triangles);
+  for (std::size_t i = 0; i < selected.size(); ++i) {
+    const std::array<int, 4>& n = Q.squares[i].node;
+    if (!selected[i]) continue;
+    triangles.push_back({n[0], n[1], n[2]});
+    triangles.push_back({n[0], n[2], n[3]});
+  }
+  return {M.x, triangles};
+}
+
+/// 5000 × the area mean over S of max(0, dist(S, S_M)/h − 1.1)²: S must be near its approximation.
+double uncovered(const TriangleTree& tree, double h, const SurfaceDistance& S) {
+  constexpr double weight = 5000, allowed = 1.1;
   double sum = 0, area = 0;
   for (const std::array<int, 3>& t : S.S.triangles) {
     const Vec3 a = S.S.points[t[0]], b = S.S.points[t[1]], c = S.S.points[t[2]];
+    const Vec3 middle = (1. / 3) * (a + b + c);
     const double part = .5 * norm(cross(b - a, c - a));
-    const double far = tree.closest((1. / 3) * (a + b + c)).distance / Q.h - allowed;
     area += part;
-    if (far > 0) sum += part * far * far;
+    if (triangleWithin(tree, middle, allowed * h) >= 0) continue;
+    const double far = tree.closest(middle).distance / h - allowed;
+    sum += part * far * far;
   }
   return weight * sum / area;
 }
 
 /// Where S has no square beside it because another surface is in the way: the place; empty:
 /// nowhere.
-std::string blockedPlace(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
-                         const Survey& survey, int side, const Selection& selected) {
+///   tree  of the selected squares
+std::string blockedPlace(const SquareSurface& Q, const SurfaceDistance& S, const Survey& survey,
+                         int side, const TriangleTree& tree) {
   constexpr double missed = 2;  // [choice] of h from S to S_M: at the rim one square may be missing
-  std::vector<std::array<int, 3>> triangles;
-  for (std::size_t i = 0; i < selected.size(); ++i) {
-    if (!selected[i]) continue;
-    const auto& n = Q.squares[i].node;
-    triangles.push_back({n[0], n[1], n[2]});
-    triangles.push_back({n[0], n[2], n[3]});
-  }
-  const TriangleTree tree(M.x, triangles);
-  for (std::size_t i = 0; i < selected.size(); ++i) {
+  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
     bool isBlocked = !survey.free[i] && survey.excess[i] == 0;
     for (int n : Q.squares[i].node) isBlocked = isBlocked && survey.side[n] == side;
     if (!isBlocked) continue;
     const Vec3 onS = S.query(Q.squares[i].centre).point;
-    if (tree.closest(onS, missed * Q.h).triangle < 0) return placeText(onS);
+    if (triangleWithin(tree, onS, missed * Q.h) < 0) return placeText(onS);
   }
   return "";
 }
@@ -5176,12 +5220,13 @@ Extraction extractSurface(const Mesh& M, const SquareSurface& Q, const SurfaceDi
     if (outline == Outline::halfSquares) rim.run(true);
   }
   result.fault = diskFault(Q, result.selected);
-  const std::string blocked = blockedPlace(M, Q, S, survey, side, result.selected);
+  const TriangleTree tree = treeOf(M, Q, result.selected);
+  const std::string blocked = blockedPlace(Q, S, survey, side, tree);
   if (!blocked.empty()) {
     result.isBlocked = true;
     result.fault = "another surface is nearer to S than its squares, near " + blocked;
   }
-  if (result.fault.empty()) result.energy = rim.energy() + uncovered(M, Q, S, result.selected);
+  if (result.fault.empty()) result.energy = rim.energy() + uncovered(tree, Q.h, S);
   return result;
 }
 
@@ -6141,18 +6186,17 @@ std::vector<int> placeNodes(Mesh& M, const ApproximatingSurface& SM, const std::
 
 }  // namespace
 
-ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool followRim) {
+namespace {
+
+/// [§3.6] surfaceProjection() with ϕ, which is the same for all ways and sizes.
+ProjectionReport projectTo(Mesh& M, const SurfaceDistance& S, SurfaceParametrization Phi,
+                           bool followRim) {
   const int k = static_cast<int>(M.surfaces.size()) + 1;
-  TriangleSurface split = cleaned;
-  splitChords(split);
-  const SurfaceDistance S(split);
-  SurfaceParametrization Phi = parametrizeSurface(S);  // ϕ, eq. (3)
   const ApproximatingSurface SM = approximatingSurface(M, k, S);
   const RimTargets targets = rimTargets(SM, Phi, followRim);
   std::vector<Vec2> u(SM.node.size());  // ϕ_M⁻¹, eq. (3)
   for (std::size_t i = 0; i < SM.rim.size(); ++i)
     u[SM.rim[i]] = rimParameter(Phi.cornerS, Phi.rim.s.back(), targets.s[i]);
-  buildLocator(Phi.surface);
   u = followRim ? anchoredMap(SM, S, Phi.surface, u)
                 : floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
 
@@ -6167,6 +6211,22 @@ ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool
     report.tangentialShift = std::max(report.tangentialShift, norm(M.x[SM.node[i]] - nearest));
   }
   return report;
+}
+
+/// ϕ, eq. (3), with its locator.
+SurfaceParametrization locatedParametrization(const SurfaceDistance& S) {
+  SurfaceParametrization Phi = parametrizeSurface(S);
+  buildLocator(Phi.surface);
+  return Phi;
+}
+
+}  // namespace
+
+ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool followRim) {
+  TriangleSurface split = cleaned;
+  splitChords(split);
+  const SurfaceDistance S(split);
+  return projectTo(M, S, locatedParametrization(S), followRim);
 }
 
 // ==== 3. Surface insertion =======================================================================
@@ -6272,6 +6332,7 @@ struct Insertion {
   Approximation A = {};
   SquareSurface Q = {};
   Survey survey = {};
+  SurfaceParametrization Phi = {};  // of S, once the first way needs it
   int ways = 0;    // tried so far, over all l_c
   int faults = 0;  // and left; why the last one was, without prefix and advice
   std::string reason = {};
@@ -6310,16 +6371,9 @@ std::string describe(const Way& way) {
 /// projection covers that. Empty: nowhere.
 std::string leftOut(const Insertion& I, const Selection& selected) {
   constexpr double farthest = 4;  // of h, from a point of S to S_M
-  std::vector<std::array<int, 3>> triangles;
-  for (std::size_t i = 0; i < selected.size(); ++i) {
-    const std::array<int, 4>& n = I.Q.squares[i].node;
-    if (!selected[i]) continue;
-    triangles.push_back({n[0], n[1], n[2]});
-    triangles.push_back({n[0], n[2], n[3]});
-  }
-  const TriangleTree tree(I.M.x, triangles);
+  const TriangleTree tree = treeOf(I.M, I.Q, selected);
   for (const Vec3& p : I.S.S.points)
-    if (tree.closest(p, farthest * I.Q.h).triangle < 0)
+    if (triangleWithin(tree, p, farthest * I.Q.h) < 0)
       return "S_M leaves out the part of S near " + placeText(p);
   return "";
 }
@@ -6462,7 +6516,8 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   I.stage("surfaceHealed", M);
   I.progress("3.5 surface healing: " + std::to_string(rounds) + " rounds, " +
              std::to_string(M.tets.size()) + " tetrahedra (" + describe(way) + ")");
-  const ProjectionReport projection = surfaceProjection(M, I.S.S, I.options.followRim);
+  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S);
+  const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim);
   report.tangentialShift = projection.tangentialShift;
   report.projected = qualityStatistics(M);
   I.stage("projected", M);
