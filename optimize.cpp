@@ -664,6 +664,7 @@ struct Smoother {
   // colour share neighbours; all write 1.
   std::vector<std::atomic<unsigned char>> awake = {};
   std::vector<unsigned char> reached = {};  // [nodes] moved by more than `wake` before the lift
+  std::vector<unsigned char> moved = {};    // [nodes] since the qualities of the lift are known
   double wake = 0;  // displacement, relative to the shortest edge, from which neighbours awake
 
   double delta = 0;      // of the sweep, relative to the mean σ
@@ -955,22 +956,34 @@ Validity validity(const Smoother& S) {
   return sumOfPieces<Validity>(S.threads, 0, static_cast<int>(S.M.tets.size()), piece, ofPiece);
 }
 
-/// q of the elements, from the closed form at their first vertex.
-std::vector<double> qualitiesOf(const Smoother& S) {
-  std::vector<double> q(S.M.tets.size());
+/// q of these elements, from the closed form at their first vertex.
+std::vector<double> qualitiesOf(const Smoother& S, const std::vector<int>& elements) {
+  std::vector<double> q(elements.size());
   const auto ofPiece = [&](int, int from, int to) {
-    for (int E = from; E < to; E += lanes) {
+    for (int k = from; k < to; k += lanes) {
       CornerBlock in{};
-      for (int i = 0; i < std::min(lanes, to - E); ++i) {
-        const std::array<Vec3, 4> x = cornersOf(S.M.x, S.M.tets[E + i]);
-        in.set(i, S.corners[4 * S.shapeOf[E + i]], x[1] - x[0], x[2] - x[0], x[3] - x[0]);
+      for (int i = 0; i < std::min(lanes, to - k); ++i) {
+        const int E = elements[k + i];
+        const std::array<Vec3, 4> x = cornersOf(S.M.x, S.M.tets[E]);
+        in.set(i, S.corners[4 * S.shapeOf[E]], x[1] - x[0], x[2] - x[0], x[3] - x[0]);
       }
       const Distortions at = distortionsOf(closedForm(in).star, 0, plainEta);
-      for (int i = 0; i < std::min(lanes, to - E); ++i) q[E + i] = 1 / at.eta[i];
+      for (int i = 0; i < std::min(lanes, to - k); ++i) q[k + i] = 1 / at.eta[i];
     }
   };
   forPieces(S.threads, 0, static_cast<int>(q.size()), piece, ofPiece);
   return q;
+}
+
+/// The elements with a vertex that is marked.
+std::vector<int> elementsAt(const Smoother& S, const std::vector<unsigned char>& marked) {
+  std::vector<int> elements;
+  for (std::size_t E = 0; E < S.M.tets.size(); ++E) {
+    const std::array<int, 4>& z = S.M.tets[E];
+    if (marked[z[0]] || marked[z[1]] || marked[z[2]] || marked[z[3]])
+      elements.push_back(static_cast<int>(E));
+  }
+  return elements;
 }
 
 // ---- one visit ---------------------------------------------------------------------------------
@@ -1141,7 +1154,9 @@ bool sweepsLeft(const Smoother& S) { return S.report.sweeps < S.options.maxSweep
 void countSweep(Smoother& S, double disp) {
   ++S.report.sweeps;
   if (!S.options.onSweep) return;
-  const std::vector<double> q = qualitiesOf(S);
+  std::vector<int> all(S.M.tets.size());
+  std::iota(all.begin(), all.end(), 0);
+  const std::vector<double> q = qualitiesOf(S, all);
   const double least = *std::min_element(q.begin(), q.end());
   const int inverted = least > 0 ? 0 : static_cast<int>(std::count(q.begin(), q.end(), 0.));
   S.options.onSweep({S.report.sweeps, inverted, least, disp});
@@ -1163,6 +1178,7 @@ double visitRows(Smoother& S, int begin, int end) {
     if (!awake.load(std::memory_order_relaxed)) continue;
     const double moved = smoothNode(S, row, visit);
     disp = std::max(disp, moved);
+    S.moved[S.order[row]] |= moved > 0;
     awake.store(moved > S.wake, std::memory_order_relaxed);
     if (moved <= S.wake) continue;
     wakeNeighbours(S, row);
@@ -1554,7 +1570,7 @@ constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is no
 /// [departure] where the worst elements are lifted afterwards, which smooths all others too: so
 /// much of it, and the sweeps end where the root mean square of the displacements is as small. To
 /// sweep on until no node moves took 2 to 10 times the visits for the same qualities in the end.
-constexpr double settledFraction = 2;
+constexpr double settledFraction = 4;
 constexpr int sweepsWithoutProgress = 3;       // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
@@ -1629,32 +1645,37 @@ constexpr int idleRounds = 2;         // in so many rounds
 constexpr double lowQuality = .45;    // below it the lift has patience:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
 constexpr double liftMaxDisp = 1e-3;  // relative to the shortest edge: a round's sweeps end there
-constexpr double liftWake = .05;      // unrest for a visit: only what happens near the worst counts
-constexpr double lastWake = .02;      // and in the last round, that of the mean
-constexpr double liftReach = .85;     // (η/η_w)^64 below it is nothing
-constexpr double liftRatio =
-    1.6;  // η/η_w at most: 1.6^64 = 1e13, and a Newton step lowers it e-fold
+constexpr double liftWake = .05;  // unrest for a visit, also in the last round: only what happens
+                                  // near the worst counts
+constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
+                                   // an element's nodes are not visited again
+/// η_w at least: of η of the worst. 1.07^64 = 76: these outweigh all others; with far less of them
+/// (η/η_w) ^64 would be 1e13 and more, and the others would be lifted farther than what is lowest.
+constexpr double liftRatio = 1.07;
+constexpr double lastLift = 1.005;  // q_w of the last round, of the lowest q: where that is kept
 
-/// q of the elements, the lowest, the mean, and what bounds the worst elements from above; of those
-/// that the sweeps have reached, since the others, as those at earlier surfaces, were lifted
-/// before.
+/// The elements that the sweeps have reached (the others, as those at earlier surfaces, were lifted
+/// before), their q, the lowest, the mean, and what bounds the worst of them from above.
 struct WorstElements {
+  std::vector<int> element;
   std::vector<double> q;
   double lowest = 1, mean = 1, bound = 1;
 };
 
-WorstElements worstElements(const Smoother& S) {
-  constexpr double notReached = 2;  // above every q
-  WorstElements worst{qualitiesOf(S)};
-  std::vector<double> q;
-  for (std::size_t E = 0; E < worst.q.size(); ++E) {
-    const std::array<int, 4>& z = S.M.tets[E];
-    if (S.reached[z[0]] || S.reached[z[1]] || S.reached[z[2]] || S.reached[z[3]])
-      q.push_back(worst.q[E]);
-    else
-      worst.q[E] = notReached;
+/// Anew after sweeps: q of the elements at nodes that have moved since, and what follows from them.
+void updateWorst(Smoother& S, WorstElements& worst) {
+  std::vector<int> changed, place;
+  for (std::size_t i = 0; i < worst.element.size(); ++i) {
+    const std::array<int, 4>& z = S.M.tets[worst.element[i]];
+    if (!S.moved[z[0]] && !S.moved[z[1]] && !S.moved[z[2]] && !S.moved[z[3]]) continue;
+    changed.push_back(worst.element[i]);
+    place.push_back(static_cast<int>(i));
   }
-  if (q.empty()) return worst;
+  const std::vector<double> now = qualitiesOf(S, changed);
+  for (std::size_t i = 0; i < place.size(); ++i) worst.q[place[i]] = now[i];
+  S.moved.assign(S.moved.size(), 0);
+
+  std::vector<double> q = worst.q;
   const double count = static_cast<double>(q.size());
   const std::size_t wanted = std::max(worstCount, static_cast<std::size_t>(worstFraction * count));
   const auto bound = q.begin() + static_cast<std::ptrdiff_t>(std::min(q.size(), wanted)) - 1;
@@ -1662,17 +1683,22 @@ WorstElements worstElements(const Smoother& S) {
   worst.lowest = *std::min_element(q.begin(), bound + 1);
   worst.mean = std::accumulate(q.begin(), q.end(), 0.) / count;
   worst.bound = *bound;
-  return worst;
 }
 
-/// One round: sweeps on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes of the worst elements on.
-void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, double wake) {
-  S.penalty = {1, qw, S.options.power};
+/// One round: sweeps on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes on at whose elements the
+/// second term has changed since the last round. By how much: with the larger and the smaller q_w
+/// of the two rounds, |Δ| = (larger/q)^power c, c = 1 − (smaller/larger)^power. So |Δ| > liftReach
+/// where q < larger (c/liftReach)^(1/power).
+void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps) {
+  const double power = S.options.power, larger = std::max(qw, S.penalty.scale);
+  const double c = 1 - std::pow(std::min(qw, S.penalty.scale) / larger, power);
+  const double reach = larger * std::pow(c / liftReach, 1 / power);
+  S.penalty = {1, qw, power};
   S.relaxation = S.options.relaxation;
-  S.wake = wake;
-  for (std::size_t E = 0; E < S.M.tets.size(); ++E)
-    if (worst.q[E] <= worst.bound / liftReach)
-      for (int n : S.M.tets[E]) wakeNode(S, n);
+  S.wake = liftWake;
+  for (std::size_t i = 0; i < worst.q.size(); ++i)
+    if (worst.q[i] < reach)
+      for (int n : S.M.tets[worst.element[i]]) wakeNode(S, n);
   for (int k = 0; k < sweeps && sweepsLeft(S); ++k)
     if (sweepNodes(S) <= liftMaxDisp) return;
 }
@@ -1682,7 +1708,12 @@ void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, d
 /// where the lowest q rises no more. A last round with η_w that of the worst element lets all the
 /// others relax and wins the mean back.
 void liftWorst(Smoother& S) {
-  WorstElements worst = worstElements(S);
+  WorstElements worst;
+  worst.element = elementsAt(S, S.reached);
+  worst.q.assign(worst.element.size(), 0);
+  if (worst.element.empty()) return;
+  S.moved.assign(S.moved.size(), 1);
+  updateWorst(S, worst);
   const double meanAtStart = worst.mean;
   if (worst.lowest > 1 - liftMinGain) return;
   double highest = worst.lowest;
@@ -1690,14 +1721,14 @@ void liftWorst(Smoother& S) {
     const bool low = worst.lowest < lowQuality;
     if (round >= (low ? patientRounds : liftRounds)) break;
     if (idle >= (low ? patientIdleRounds : idleRounds)) break;
-    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftSweeps, liftWake);
-    worst = worstElements(S);
+    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftSweeps);
+    updateWorst(S, worst);
     if (worst.mean < meanAtStart - liftMeanLoss) break;
     const bool rises = worst.lowest >= highest + liftMinGain;
     idle = rises ? 0 : idle + 1;
     if (rises) highest = worst.lowest;
   }
-  liftRound(S, worst, worst.lowest, lastSweeps, lastWake);
+  liftRound(S, worst, lastLift * worst.lowest, lastSweeps);
 }
 
 // ---- input -------------------------------------------------------------------------------------
@@ -1821,6 +1852,7 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   buildSheets(S);
   S.awake = std::vector<std::atomic<unsigned char>>(M.x.size());
   S.reached.assign(M.x.size(), options.active.empty());
+  S.moved.assign(M.x.size(), 0);
   for (int n : options.active.empty() ? S.order : options.active) wakeNode(S, n);
 
   S.report.converged = untangleAndSmooth(S);
