@@ -6327,7 +6327,8 @@ struct Way {
 struct Insertion {
   const SurfaceDistance& S;
   const InsertOptions& options;
-  int k;        // number of the new surface
+  int k;         // number of the new surface
+  bool crosses;  // S itself
   Mesh M = {};  // refined by §3.2 and §3.3
   Approximation A = {};
   SquareSurface Q = {};
@@ -6461,10 +6462,15 @@ std::vector<int> loosen(Mesh& M, const std::vector<int>& elements, int k) {
   return nodes;
 }
 
+/// [choice] Tangled sweeps after which a way is put aside while there are others: most are valid
+/// after 1 to 4, and those that need more are seldom better in the end (by .01 in the lowest q).
+constexpr int impatientSweeps = 5;
+
 /// §3.7, and [departure] where a few elements stay inverted, or poor as where S_M bridges a slit:
 /// these are loosened, as long as there are fewer inverted ones, or the lowest q rises. No global
 /// descent here: other ways of inserting S are cheaper.
-void optimizeAround(Mesh& M, const Insertion& I, InsertReport& report) {
+///   patient  false: a mesh that is still tangled after a few sweeps is left as it is
+void optimizeAround(Mesh& M, const Insertion& I, bool patient, InsertReport& report) {
   constexpr int maxRounds = 4;
   constexpr int patientSweeps = 150;  // while tangled, of a loosened mesh: few elements are left
   constexpr std::size_t few = 60;
@@ -6473,8 +6479,10 @@ void optimizeAround(Mesh& M, const Insertion& I, InsertReport& report) {
   OptimizeOptions optimize = I.options.optimize;
   optimize.globalDescent = false;
   optimize.active = nodesNear(M, I.k);
+  if (!patient) optimize.maxTangledSweeps = std::min(optimize.maxTangledSweeps, impatientSweeps);
   OptimizeReport& best = report.optimization;
   best = optimizeMesh(M, optimize);
+  if (!patient && best.inverted > 0) return;
   double factor = narrow;
   for (int round = 0; round < maxRounds; ++round) {
     const bool valid = best.inverted == 0;
@@ -6504,7 +6512,8 @@ Vec3 firstInverted(const Mesh& M) {
 }
 
 /// §3.4's labels, 3.5, 3.6 and 3.7 on a copy of the refined mesh.
-void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
+///   returns  false: put aside, still tangled
+bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertReport& report) {
   Bisection B(M);
   labelSurface(B, I.Q, I.A, way.extraction.selected, I.k);
   report.way = ++I.ways;
@@ -6522,15 +6531,18 @@ void insertOnWay(Insertion& I, const Way& way, Mesh& M, InsertReport& report) {
   report.projected = qualityStatistics(M);
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
-  optimizeAround(M, I, report);
+  optimizeAround(M, I, patient, report);
   report.smoothed = qualityStatistics(M);
   I.progress("3.7 optimization: " + std::to_string(report.optimization.sweeps) + " sweeps, " +
              std::to_string(report.smoothed.inverted) + " inverted, min " +
              number(report.smoothed.min) + ", mean " + number(report.smoothed.mean));
-  if (report.smoothed.inverted > 0)
+  if (report.smoothed.inverted == 0) return true;
+  if (patient)
     throw MethodError("insertSurface (§3.7): " + std::to_string(report.smoothed.inverted) +
                       " elements stay inverted, of " + std::to_string(report.projected.inverted) +
                       " after the projection, the first near " + placeText(firstInverted(M)));
+  I.progress(describe(way) + " put aside: other ways first");
+  return false;
 }
 
 /// The measures of S_M that the report promises.
@@ -6585,29 +6597,32 @@ void judgeSurface(double h, InsertReport& report) {
 constexpr double betterBy = .01;
 
 /// Follows one way; keeps its mesh and report where it is the best valid one so far.
-void tryWay(Insertion& I, const Way& way, double lc, Mesh& result, InsertReport& report) {
+///   returns  false: put aside
+bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
+            InsertReport& report) {
   Mesh trial = I.M;
   InsertReport ofThisWay;
   ofThisWay.original = report.original;
   ofThisWay.surface = I.k, ofThisWay.lc = lc;
   try {
-    insertOnWay(I, way, trial, ofThisWay);
+    if (!insertOnWay(I, way, patient, trial, ofThisWay)) return false;
     measureSurface(trial, I.S, ofThisWay);
     I.progress("S_M: Hausdorff distance " + number(ofThisWay.hausdorff) + ", " +
                number(ofThisWay.hausdorff / lc) + " l_c");
     judgeSurface(I.Q.h, ofThisWay);
   } catch (const MethodError& error) {
     I.leave(describe(way), error);
-    return;
+    return true;
   } catch (const SolverError& error) {
     I.leave(describe(way), error);
-    return;
+    return true;
   }
   // beside earlier surfaces the lowest q may be theirs, on every way
   double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
   if (ofThisWay.hausdorff > poorHausdorff * lc) lowest *= poorWorth;
   if (report.surface == 0 || lowest > I.lowest + betterBy)
     report = ofThisWay, result = std::move(trial), I.lowest = lowest;
+  return true;
 }
 
 /// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
@@ -6654,14 +6669,21 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
     return tets >= large && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
   };
   std::vector<Selection> tried;
+  std::vector<Way> aside;
   for (Outline outline : outlines)
     if (!isGood() && (outline == outlines[0] || !isPoor()))
       for (const Way& way : extractWays(I, outline)) {
         const Selection& selected = way.extraction.selected;
         if (isGood() || std::find(tried.begin(), tried.end(), selected) != tried.end()) continue;
         tried.push_back(selected);
-        tryWay(I, way, lc, result, report);
+        const bool patient = outline == Outline::paper;
+        if (!tryWay(I, way, patient, lc, result, report)) aside.push_back(way);
       }
+  // [choice] those put aside, while nothing is valid or of this quality
+  constexpr double enough = .45;
+  for (const Way& way : aside)
+    if (!isGood() && (report.surface == 0 || I.lowest < enough))
+      tryWay(I, way, true, lc, result, report);
 }
 
 /// [§3.2] The sizes to try one after the other: l_c as given and [choice] its halves; for a
@@ -6742,8 +6764,7 @@ void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, M
   const InsertReport start = report;
   double last = sizes[0], nearest = beyondAll;
   // [choice] no l_c resolves a crossing: one that is small enough to vanish does so at the first
-  const bool crosses = !selfCrossings(I.S.S).empty();
-  const int most = crosses ? 1 : I.options.lc > 0 ? maxTries : static_cast<int>(sizes.size());
+  const int most = I.crosses ? 1 : I.options.lc > 0 ? maxTries : static_cast<int>(sizes.size());
   int tries = 0;
   for (std::size_t i = 0; i < sizes.size() && tries < most; ++i) {
     const int waysBefore = I.ways;
@@ -6791,6 +6812,7 @@ struct Candidate {
   SurfaceDistance S;
   std::string label;  // for messages
   std::vector<std::string> warnings;
+  bool crosses;  // itself
 };
 
 Candidate candidateOf(const TriangleSurface& S, const std::string& label,
@@ -6800,7 +6822,7 @@ Candidate candidateOf(const TriangleSurface& S, const std::string& label,
   if (!crossings.empty())
     warnings.push_back(describe(crossings) + "; mend it there if the insertion fails");
   splitChords(disk);
-  return {SurfaceDistance(disk), label, std::move(warnings)};
+  return {SurfaceDistance(disk), label, std::move(warnings), !crossings.empty()};
 }
 
 /// Does what step() does; its errors begin with the label of the surface.
@@ -6862,7 +6884,7 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
   report.original = qualityStatistics(M);
 
   SizeChoice chosen;
-  Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1};
+  Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
   if (options.lc == 0 && options.tolerance == 0) {
     chosen = chooseSize(M, cleaned);
     I.progress("3.2 l_c = " + number(chosen.lc) + " chosen: " + describe(chosen));

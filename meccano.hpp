@@ -603,16 +603,15 @@ TriangleTree::Box boxOf(const std::array<Vec3, 3>& corners);
 
 template <class Found>
 void TriangleTree::visit(Vec3 lo, Vec3 hi, Found found) const {
-  std::vector<int> stack;
-  if (!nodes.empty()) stack.push_back(0);
-  while (!stack.empty()) {
-    int n = stack.back();
-    stack.pop_back();
+  int stack[64], height = 0;  // each level halves the triangles: 32 levels at most
+  if (!nodes.empty()) stack[height++] = 0;
+  while (height > 0) {
+    const int n = stack[--height];
     const Node& node = nodes[n];
     if (!boxesMeet(node.box, lo, hi)) continue;
     if (node.count == 0) {
-      stack.push_back(node.right);
-      stack.push_back(n + 1);
+      stack[height++] = node.right;
+      stack[height++] = n + 1;
     }
     for (int i = node.first; i < node.first + node.count; ++i) {
       if (boxesMeet(boxOf(corners[i]), lo, hi) && found(triangle[i])) return;
