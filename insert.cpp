@@ -3768,7 +3768,8 @@ void keepNearerOnEdge(Vec3 x, const std::array<Vec3, 3>& corner, int i, ClosestP
 /// Distance of two boxes, 0 where they meet; a point is a box too.
 double boxDistance(const TriangleTree::Box& a, const TriangleTree::Box& b) {
   const Vec3 after = a.lo - b.hi, before = b.lo - a.hi;
-  return norm(Vec3{std::max(std::max(after.x, before.x), 0.), std::max(std::max(after.y, before.y), 0.),
+  return norm(Vec3{std::max(std::max(after.x, before.x), 0.),
+                   std::max(std::max(after.y, before.y), 0.),
                    std::max(std::max(after.z, before.z), 0.)});
 }
 
@@ -4573,6 +4574,56 @@ void volumetricHealing(Bisection& B, Approximation& A) {
 
 namespace {
 
+/// The cubes of T.
+struct Cubes {
+  KeyMap number;                    // cube → 1 + its place in the others
+  std::vector<std::uint64_t> keys;  // in the lattice
+  std::vector<Vec3> centres;        // physical, of the elements' mean
+  Cubes(const Mesh& M, const Approximation& A) {
+    const Lattice lattice(A.level);
+    std::vector<int> elements;
+    for (int E : elementsOf(A.T)) {
+      const std::uint64_t key = lattice.cubeOf(M, E);
+      int& n = number[key];
+      if (n == 0) {
+        keys.push_back(key), centres.push_back({0, 0, 0}), elements.push_back(0);
+        n = static_cast<int>(keys.size());
+      }
+      for (int v : M.tets[E]) centres[n - 1] = centres[n - 1] + .25 * M.x[v];
+      ++elements[n - 1];
+    }
+    for (std::size_t c = 0; c < keys.size(); ++c) centres[c] = (1. / elements[c]) * centres[c];
+  }
+};
+
+}  // namespace
+
+Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S) {
+  const Lattice lattice(A.level);
+  const auto isAbove = [&](const Cubes& cubes, int E) {
+    return S.query(cubes.centres[cubes.number.get(lattice.cubeOf(B.M, E)) - 1]).side >= 0;
+  };
+  const Cubes cut(B.M, A);
+  std::vector<char> seen(B.M.x.size(), 0);
+  std::vector<int> lower;  // nodes below S of cubes above
+  for (int E : elementsOf(A.T)) {
+    if (!isAbove(cut, E)) continue;
+    for (int n : B.M.tets[E])
+      if (lattice.isNode(B.M.xi[n]) && !seen[n]++ && !isOnBoundary(B.M, n) &&
+          S.query(B.M.x[n]).side < 0)
+        lower.push_back(n);
+  }
+  Approximation layer = A;
+  for (int n : lower) addElementsAt(B, layer, n);
+  const Cubes cubes(B.M, layer);
+  Approximation middle = layer;
+  middle.isMiddle = true;
+  for (int E : elementsOf(layer.T)) middle.T[E] = !isAbove(cubes, E);
+  return middle;
+}
+
+namespace {
+
 /// The longest edge of a face in the computational space: the one that bisection splits first.
 std::pair<int, int> refinementEdge(const Mesh& M, std::array<int, 3> face) {
   std::pair<int, int> longest{face[0], face[1]};
@@ -4586,21 +4637,15 @@ std::pair<int, int> refinementEdge(const Mesh& M, std::array<int, 3> face) {
 
 /// The squares of ∂T: faces of cubes in T whose other cube is not, counter-clockwise from outside.
 void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, SquareSurface& Q) {
-  const Lattice lattice(A.level);
-  KeyMap inside;
-  std::vector<std::uint64_t> cubes;
-  for (int E : elementsOf(A.T)) {
-    const std::uint64_t key = lattice.cubeOf(M, E);
-    if (!inside[key]++) cubes.push_back(key);
-  }
-  for (std::uint64_t key : cubes) {
-    const std::array<std::int64_t, 3> cube = Lattice::position(key);
+  const Cubes cubes(M, A);
+  for (std::size_t c = 0; c < cubes.keys.size(); ++c) {
+    const std::array<std::int64_t, 3> cube = Lattice::position(cubes.keys[c]);
     for (int axis = 0; axis < 3; ++axis)
       for (int side = -1; side <= 1; side += 2) {
         std::array<std::int64_t, 3> beyond = cube, centre = cube;
         beyond[axis] += 2 * side;
         centre[axis] += side;
-        if (inside.get(Lattice::key(beyond))) continue;
+        if (cubes.number.get(Lattice::key(beyond))) continue;
         const int a1 = (axis + (side > 0 ? 1 : 2)) % 3, a2 = (axis + (side > 0 ? 2 : 1)) % 3;
         constexpr int around[4][2] = {{-1, -1}, {1, -1}, {1, 1}, {-1, 1}};
         Square s;
@@ -4611,6 +4656,7 @@ void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, S
           s.node[e] = meshNode.get(Lattice::key(corner)) - 1;
         }
         s.centre = .25 * (M.x[s.node[0]] + M.x[s.node[1]] + M.x[s.node[2]] + M.x[s.node[3]]);
+        s.beyond = 2 * s.centre - cubes.centres[c];
         Q.squares.push_back(s);
         Q.keys.push_back(Lattice::key(centre));
       }
@@ -4679,7 +4725,7 @@ void collectNodes(SquareSurface& Q, int meshNodes) {
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
   const Lattice lattice(A.level);
   SquareSurface Q;
-  Q.level = A.level;
+  Q.level = A.level, Q.isMiddle = A.isMiddle;
   Q.h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) / lattice.scale;
   KeyMap meshNode;
   for (int E : elementsOf(A.T))
@@ -4711,6 +4757,7 @@ namespace {
 /// Quarter e of a square is the triangle of its corners e, e + 1 and its centre.
 struct Survey {
   std::vector<signed char> side;  // [mesh nodes], +1 or −1, 0 off ∂T
+  std::vector<char> facesUp;      // [squares] of a middle layer, 1: the cube beyond is above S
   std::vector<char> free;         // [squares], 0: touches another surface, or lies beyond it
   std::vector<double> excess;     // [squares], tangential excess of the centre beyond the rim, in h
   std::vector<std::array<double, 4>> beyond;  // [squares], the same of the quarters
@@ -4761,6 +4808,7 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
     isFree = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
     survey.free.push_back(isFree);
     survey.excess.push_back(perH * middle.excess);
+    if (Q.isMiddle) survey.facesUp.push_back(S.query(s.beyond).side >= 0);
     std::array<double, 4> beyond{}, above{};
     for (int e = 0; e < 4; ++e) {
       const SurfaceQuery near =
@@ -4795,6 +4843,18 @@ std::vector<int> connectedParts(const SquareSurface& Q, In in, std::vector<int>&
 
 int largestPart(const std::vector<int>& sizes) {
   return static_cast<int>(std::max_element(sizes.begin(), sizes.end()) - sizes.begin());
+}
+
+/// Whether a square is between S and the other side of it: the corners that the selected quarters
+/// use are on this side. [departure] Of a middle layer: the cube beyond it is above S.
+bool isOnSide(const SquareSurface& Q, const Survey& survey, int i, int side,
+              unsigned char quarters) {
+  if (Q.isMiddle) return survey.facesUp[i];
+  for (int e = 0; e < 4; ++e) {
+    const bool used = (quarters >> e & 1) || (quarters >> ((e + 3) % 4) & 1);
+    if (used && survey.side[Q.squares[i].node[e]] != side) return false;
+  }
+  return true;
 }
 
 /// [choice] Keeps the largest edge-connected part of the selection and fills its holes.
@@ -4862,9 +4922,9 @@ Selection selectSquares(const SquareSurface& Q, const Survey& survey, int side) 
   constexpr int maxRounds = 100;
   Selection selected(Q.squares.size(), emptySquare);
   for (std::size_t i = 0; i < Q.squares.size(); ++i) {
-    bool oneSide = survey.free[i] && survey.excess[i] <= maxExcess;
-    for (int n : Q.squares[i].node) oneSide &= survey.side[n] == side;
-    if (oneSide) selected[i] = fullSquare;
+    if (survey.free[i] && survey.excess[i] <= maxExcess &&
+        isOnSide(Q, survey, static_cast<int>(i), side, fullSquare))
+      selected[i] = fullSquare;
   }
   for (int round = 0; round < maxRounds; ++round) {
     keepLargestPart(Q, survey, selected);
@@ -4993,13 +5053,7 @@ class RimRegularization {
 
   /// Full needs all nodes on the side, a half its three corners.
   bool isAllowed(int i, unsigned char state) const {
-    if (state == emptySquare) return true;
-    if (!survey_.free[i]) return false;
-    for (int e = 0; e < 4; ++e) {
-      const bool used = (state >> e & 1) || (state >> ((e + 3) % 4) & 1);
-      if (used && survey_.side[Q_.squares[i].node[e]] != side_) return false;
-    }
-    return true;
+    return state == emptySquare || (survey_.free[i] && isOnSide(Q_, survey_, i, side_, state));
   }
 
   double nodeEnergy(int n) const {
@@ -5012,8 +5066,7 @@ class RimRegularization {
   double squareEnergy(int i) const {
     double E = 0;
     for (int e = 0; e < 4; ++e) {
-      const auto& n = Q_.squares[i].node;
-      if (survey_.side[n[e]] != side_ || survey_.side[n[(e + 1) % 4]] != side_) continue;
+      if (!isOnSide(Q_, survey_, i, side_, static_cast<unsigned char>(1 << e))) continue;
       const double distance = selected_[i] >> e & 1 ? survey_.beyond[i][e] : survey_.above[i][e];
       E += .25 * distance * distance;
     }
@@ -5174,10 +5227,9 @@ double uncovered(const TriangleTree& tree, double h, const SurfaceDistance& S) {
 std::string blockedPlace(const SquareSurface& Q, const SurfaceDistance& S, const Survey& survey,
                          int side, const TriangleTree& tree) {
   constexpr double missed = 2;  // [choice] of h from S to S_M: at the rim one square may be missing
-  for (std::size_t i = 0; i < Q.squares.size(); ++i) {
-    bool isBlocked = !survey.free[i] && survey.excess[i] == 0;
-    for (int n : Q.squares[i].node) isBlocked = isBlocked && survey.side[n] == side;
-    if (!isBlocked) continue;
+  for (int i = 0; i < static_cast<int>(Q.squares.size()); ++i) {
+    if (survey.free[i] || survey.excess[i] > 0 || !isOnSide(Q, survey, i, side, fullSquare))
+      continue;
     const Vec3 onS = S.query(Q.squares[i].centre).point;
     if (triangleWithin(tree, onS, missed * Q.h) < 0) return placeText(onS);
   }
@@ -5193,7 +5245,7 @@ void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistan
     const Vec3 point = S.S.points[S.rim[corners.at[c]]];
     int nearest = -1;
     for (int n : Q.nodes)
-      if (survey.side[n] == side &&
+      if ((Q.isMiddle || survey.side[n] == side) &&
           (nearest < 0 || norm2(M.x[n] - point) < norm2(M.x[nearest] - point)))
         nearest = n;
     if (nearest >= 0) survey.sharp[nearest] = 1;
@@ -6323,19 +6375,24 @@ struct Way {
   Extraction extraction;
 };
 
+/// The mesh refined by §3.2 and §3.3, 𝓣 or its middle, and its squares.
+struct Layer {
+  Mesh M = {};
+  Approximation A = {};
+  SquareSurface Q = {};
+  Survey survey = {};
+};
+
 /// The state of an insertion, from the copy of the caller's mesh on.
 struct Insertion {
   const SurfaceDistance& S;
   const InsertOptions& options;
   int k;         // number of the new surface
   bool crosses;  // S itself
-  Mesh M = {};  // refined by §3.2 and §3.3
-  Approximation A = {};
-  SquareSurface Q = {};
-  Survey survey = {};
+  Layer layer = {};
   SurfaceParametrization Phi = {};  // of S, once the first way needs it
-  int ways = 0;    // tried so far, over all l_c
-  int faults = 0;  // and left; why the last one was, without prefix and advice
+  int ways = 0;                     // tried so far, over all l_c
+  int faults = 0;                   // and left; why the last one was, without prefix and advice
   std::string reason = {};
   bool isBlocked = false;   // at this l_c, by an earlier surface
   bool wasBlocked = false;  // at some l_c
@@ -6364,17 +6421,19 @@ std::string describe(const std::vector<Crossing>& crossings) {
 }
 
 std::string describe(const Way& way) {
-  return std::string(way.side > 0 ? "positive" : "negative") + " side, " +
-         (way.outline == Outline::halfSquares ? "half squares" : "whole squares");
+  return std::string(way.side > 0   ? "positive side"
+                     : way.side < 0 ? "negative side"
+                                    : "middle") +
+         ", " + (way.outline == Outline::halfSquares ? "half squares" : "whole squares");
 }
 
 /// [choice] Where S_M leaves a part of S out, as a finger whose squares are hidden in T: no
 /// projection covers that. Empty: nowhere.
 std::string leftOut(const Insertion& I, const Selection& selected) {
   constexpr double farthest = 4;  // of h, from a point of S to S_M
-  const TriangleTree tree = treeOf(I.M, I.Q, selected);
+  const TriangleTree tree = treeOf(I.layer.M, I.layer.Q, selected);
   for (const Vec3& p : I.S.S.points)
-    if (triangleWithin(tree, p, farthest * I.Q.h) < 0)
+    if (triangleWithin(tree, p, farthest * I.layer.Q.h) < 0)
       return "S_M leaves out the part of S near " + placeText(p);
   return "";
 }
@@ -6386,8 +6445,9 @@ constexpr double mirrored = .01;
 /// §3.4 on both sides: the ways to go on with this outline, best first.
 std::vector<Way> extractWays(Insertion& I, Outline outline) {
   std::vector<Way> ways;
-  for (int side : {1, -1}) {
-    Way way{side, outline, extractSurface(I.M, I.Q, I.S, I.survey, side, outline)};
+  for (int side : I.layer.Q.isMiddle ? std::vector<int>{0} : std::vector<int>{1, -1}) {
+    Way way{side, outline,
+            extractSurface(I.layer.M, I.layer.Q, I.S, I.layer.survey, side, outline)};
     const std::string missing =
         way.extraction.fault.empty() ? leftOut(I, way.extraction.selected) : "";
     if (!missing.empty())
@@ -6515,7 +6575,7 @@ Vec3 firstInverted(const Mesh& M) {
 ///   returns  false: put aside, still tangled
 bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertReport& report) {
   Bisection B(M);
-  labelSurface(B, I.Q, I.A, way.extraction.selected, I.k);
+  labelSurface(B, I.layer.Q, I.layer.A, way.extraction.selected, I.k);
   report.way = ++I.ways;
   I.stage("extracted", M);
   const int rounds = surfaceHealing(B, I.k);
@@ -6600,7 +6660,7 @@ constexpr double betterBy = .01;
 ///   returns  false: put aside
 bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
             InsertReport& report) {
-  Mesh trial = I.M;
+  Mesh trial = I.layer.M;
   InsertReport ofThisWay;
   ofThisWay.original = report.original;
   ofThisWay.surface = I.k, ofThisWay.lc = lc;
@@ -6609,7 +6669,7 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
     measureSurface(trial, I.S, ofThisWay);
     I.progress("S_M: Hausdorff distance " + number(ofThisWay.hausdorff) + ", " +
                number(ofThisWay.hausdorff / lc) + " l_c");
-    judgeSurface(I.Q.h, ofThisWay);
+    judgeSurface(I.layer.Q.h, ofThisWay);
   } catch (const MethodError& error) {
     I.leave(describe(way), error);
     return true;
@@ -6628,46 +6688,62 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
 /// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
 /// come nearer.
 void checkFacesApart(Insertion& I) {
-  const Gap gap = smallestGap(I.S.tree, I.M.x, facesAround(I.M, I.S, 0));
+  const Gap gap = smallestGap(I.S.tree, I.layer.M.x, facesAround(I.layer.M, I.S, 0));
   if (gap.triangle < 0 || gap.distance > 0) return;
   I.isBlocked = true;
   throw MethodError("insertSurface (§3.2): S crosses the faces of an earlier surface" + at(gap) +
                     "; lower l_c");
 }
 
-/// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
-/// report.
-void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, InsertReport& report) {
-  // [choice] min q below which the other ways are tried too: above 50k tetrahedra they cost too
-  // much, and above 200k minutes
-  constexpr double goodQuality = .6, goodLargeQuality = .45, goodHugeQuality = .3;
-  constexpr std::size_t large = 50000, huge = 200000;
-  I.M = M;
-  Bisection B(I.M);
-  I.A = volumetricApproximation(B, I.S, lc);
-  I.stage("approximated", I.M);
+/// §3.2 and §3.3: 𝓣 and its squares.
+void approximate(Insertion& I, const Mesh& M, double lc) {
+  I.layer.M = M;
+  Bisection B(I.layer.M);
+  I.layer.A = volumetricApproximation(B, I.S, lc);
+  I.stage("approximated", I.layer.M);
   checkFacesApart(I);
-  volumetricHealing(B, I.A);
-  I.Q = boundarySquares(I.M, I.A);
-  if (!I.Q.fault.empty() && I.options.outline == Outline::paper)
-    throw MethodError("insertSurface (§3.3): " + I.Q.fault + "; lower l_c");
-  if (!I.Q.fault.empty()) I.progress("3.3 healing: " + I.Q.fault + "; S_M may still be a disk");
-  I.survey = surveySquares(I.M, I.Q, I.S);
-  I.stage("healed", I.M);
-  I.progress("3.2-3.3 approximation: " + std::to_string(I.M.tets.size()) + " tetrahedra, " +
-             std::to_string(I.Q.squares.size()) + " squares around S, h = " + number(I.Q.h));
-  const std::size_t tets = I.M.tets.size();
-  const double good = tets < large ? goodQuality : tets < huge ? goodLargeQuality : goodHugeQuality;
-  auto isGood = [&] {
-    return report.surface > 0 &&
-           (I.lowest >= std::min(good, report.original.min) || I.options.outline == Outline::paper);
-  };
-  std::vector<Outline> outlines{I.options.outline};
-  if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
+  volumetricHealing(B, I.layer.A);
+}
+
+/// The same of its middle, in the mesh as 𝓣 left it.
+void approximateMiddle(Insertion& I) {
+  Bisection B(I.layer.M);
+  I.layer.A = middleApproximation(B, I.layer.A, I.S);
+  volumetricHealing(B, I.layer.A);
+}
+
+void survey(Insertion& I) {
+  Layer& layer = I.layer;
+  layer.Q = boundarySquares(layer.M, layer.A);
+  if (!layer.Q.fault.empty() && I.options.outline == Outline::paper)
+    throw MethodError("insertSurface (§3.3): " + layer.Q.fault + "; lower l_c");
+  if (!layer.Q.fault.empty())
+    I.progress("3.3 healing: " + layer.Q.fault + "; S_M may still be a disk");
+  layer.survey = surveySquares(layer.M, layer.Q, I.S);
+  I.stage("healed", layer.M);
+  I.progress((layer.Q.isMiddle ? "3.3 middle: " : "3.2-3.3 approximation: ") +
+             std::to_string(layer.M.tets.size()) + " tetrahedra, " +
+             std::to_string(layer.Q.squares.size()) +
+             " squares around S, h = " + number(layer.Q.h));
+}
+
+/// [choice] The lowest q at which no other way is tried: above 50k tetrahedra they cost too much,
+/// and above 200k minutes.
+double goodQuality(std::size_t tets) { return tets < 50000 ? .6 : tets < 200000 ? .45 : .3; }
+
+/// The ways of a layer until one is good; those put aside because they stay tangled are returned.
+std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& report) {
+  constexpr std::size_t large = 50000;
+  const std::size_t tets = I.layer.M.tets.size();
+  const bool isPaper = I.options.outline == Outline::paper;
+  const double good = std::min(goodQuality(tets), report.original.min);
+  auto isGood = [&] { return report.surface > 0 && (I.lowest >= good || isPaper); };
   // [choice] nor, there, whole squares where S_M of half squares is far from S: theirs is as far
   auto isPoor = [&] {
     return tets >= large && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
   };
+  std::vector<Outline> outlines{I.options.outline};
+  if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
   std::vector<Selection> tried;
   std::vector<Way> aside;
   for (Outline outline : outlines)
@@ -6676,14 +6752,40 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
         const Selection& selected = way.extraction.selected;
         if (isGood() || std::find(tried.begin(), tried.end(), selected) != tried.end()) continue;
         tried.push_back(selected);
-        const bool patient = outline == Outline::paper;
-        if (!tryWay(I, way, patient, lc, result, report)) aside.push_back(way);
+        if (!tryWay(I, way, isPaper, lc, result, report)) aside.push_back(way);
       }
-  // [choice] those put aside, while nothing is valid or of this quality
-  constexpr double enough = .45;
+  return aside;
+}
+
+/// [departure] The middle of 𝓣, and [choice] at last the ways of its sides that were put aside.
+template <class Enough>
+void tryMiddle(Insertion& I, const std::vector<Way>& aside, Enough isEnough, double lc,
+               Mesh& result, InsertReport& report) {
+  const Layer sides = I.layer;
+  try {
+    approximateMiddle(I);
+    survey(I);
+    for (const Way& way : tryWays(I, lc, result, report))
+      if (!isEnough()) tryWay(I, way, true, lc, result, report);
+  } catch (const MethodError& error) {
+    I.leave("middle", error);
+  }
+  I.layer = sides;
   for (const Way& way : aside)
-    if (!isGood() && (report.surface == 0 || I.lowest < enough))
-      tryWay(I, way, true, lc, result, report);
+    if (!isEnough()) tryWay(I, way, true, lc, result, report);
+}
+
+/// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
+/// report.
+void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, InsertReport& report) {
+  approximate(I, M, lc);
+  survey(I);
+  // [choice] below this lowest q the middle is tried as well, at any size
+  const double enough = std::min({.45, goodQuality(I.layer.M.tets.size()), report.original.min});
+  auto isEnough = [&] { return report.surface > 0 && I.lowest >= enough; };
+  const std::vector<Way> aside = tryWays(I, lc, result, report);
+  if (!isEnough() && I.options.outline != Outline::paper)
+    tryMiddle(I, aside, isEnough, lc, result, report);
 }
 
 /// [§3.2] The sizes to try one after the other: l_c as given and [choice] its halves; for a

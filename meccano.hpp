@@ -701,8 +701,9 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S);
 
 /// 𝓣: the tetrahedra cut by S, and more; all of at least this level once §3.2 is done.
 struct Approximation {
-  std::vector<char> T;  // [tets], 1: in 𝓣
-  int level = 0;        // a multiple of 3: whole cubes
+  std::vector<char> T;    // [tets], 1: in 𝓣
+  int level = 0;          // a multiple of 3: whole cubes
+  bool isMiddle = false;  // a middleApproximation()
 };
 /// [§3.2, eq. (1)] Refines the tetrahedra cut by S until none has r^E >= l_c.
 Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc);
@@ -735,12 +736,14 @@ struct Square {
   std::array<int, 4> across;      // square across the edge from corner e to corner e + 1
   std::array<int, 4> acrossEdge;  // that edge's number there
   Vec3 centre;                    // physical
+  Vec3 beyond;       // centre of the cube outside 𝓣, that of the cube inside mirrored
   int diagonal = 0;  // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
 };
 /// ∂𝓣 as squares, a topological sphere but for `fault`.
 struct SquareSurface {
   std::string fault = {};  // why it is no sphere; empty: it is one
   int level = 0;           // of 𝓣
+  bool isMiddle = false;   // of a middleApproximation()
   double h = 0;            // physical edge of a cube
   std::vector<Square> squares;
   std::vector<std::uint64_t> keys;          // [squares], place in the computational lattice
@@ -751,6 +754,11 @@ struct SquareSurface {
 /// [§3.3, §3.4] [departure] Where ∂𝓣 is no sphere it says so in `fault`: a pocket in a finger two
 /// cubes wide, or fingers that nearly touch, spoil one side of S and leave S_M a disk on the other.
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
+/// [departure] Where neither side of a healed 𝓣 will do: the cubes whose centres are below S, of 𝓣
+/// and of those refined around the lower nodes of the others. The part of its boundary that faces
+/// up runs through the middle of 𝓣, half as far from S as the sides of 𝓣 are. To be healed by
+/// volumetricHealing().
+Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S);
 
 /// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1
 /// and the centre. 0 nothing, 15 the square; 3, 6, 12, 9 the halves along a diagonal.

@@ -257,6 +257,33 @@ TEST_SUITE("3.4") {
     }
   }
 
+  TEST_CASE("the middle: squares between cubes above and below, half as far from S as the sides") {
+    for (const Try& t : tries()) {
+      Steps I(boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), t.S);
+      I.approximate(t.lc);
+      I.heal();
+      const auto meanDistance = [&](int side) {
+        const Extraction X = surfaceExtraction(I.M, I.Q, I.S, side, Outline::squares);
+        REQUIRE(X.fault == "");
+        double most = 0;
+        for (int n : cornersOf(I.Q, X.selected))
+          most = std::max(most, I.S.query(I.M.x[n]).distance);
+        for (std::size_t i = 0; i < I.Q.squares.size(); ++i)
+          if (X.selected[i] && side == 0) {
+            CHECK(I.S.query(I.Q.squares[i].beyond).side >= 0);
+            const Vec3 inside = 2 * I.Q.squares[i].centre - I.Q.squares[i].beyond;
+            CHECK(I.S.query(inside).side < 0);
+          }
+        return sum / static_cast<double>(corners.size());
+      };
+      const double sides = std::min(meanDistance(1), meanDistance(-1));
+      I.A = middleApproximation(I.B, I.A, I.S);
+      I.heal();
+      CHECK(I.Q.isMiddle);
+      CHECK(meanDistance(0) < .6 * sides);
+    }
+  }
+
   TEST_CASE("half squares: rules (a) to (d) on the masks, both sides") {
     int halves = 0;
     for (const Try& t : tries()) {
