@@ -4,6 +4,7 @@
 // approximation and its healing, surface extraction and its healing, surface projection; and
 // insertSurface, which calls them in the paper's order. Section 3.7 is optimize.cpp.
 #include <algorithm>
+#include <cfloat>
 #include <cstdint>
 #include <cstdio>
 #include <map>
@@ -4060,11 +4061,11 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
   return largest;
 }
 
-}  // namespace
-
-Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
-                const std::vector<std::array<int, 3>>& triangles) {
-  Gap gap{beyondAll, -1, -1, {}};
+/// smallestGap() where it is below `within`; else no triangle, and that distance. Other triangles
+/// are then passed over by their boxes.
+Gap gapWithin(const TriangleTree& tree, const std::vector<Vec3>& points,
+              const std::vector<std::array<int, 3>>& triangles, double within) {
+  Gap gap{within, -1, -1, {}};
   for (std::size_t o = 0; o < triangles.size() && !tree.nodes.empty(); ++o) {
     const std::array<int, 3>& v = triangles[o];
     const std::array<Vec3, 3> other{points[v[0]], points[v[1]], points[v[2]]};
@@ -4077,6 +4078,13 @@ Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
     });
   }
   return gap;
+}
+
+}  // namespace
+
+Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
+                const std::vector<std::array<int, 3>>& triangles) {
+  return gapWithin(tree, points, triangles, beyondAll);
 }
 
 std::vector<Crossing> selfCrossings(const TriangleSurface& S) {
@@ -4352,12 +4360,15 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
       !selfCrossings(S.S).empty())
     size.lc = size.finest = 2 * diagonal * aboveDiagonal;
 
-  const Gap boundary = smallestGap(S.tree, M.x, patchFaces(M));
-  limit("the distance of S to the boundary", boundary.distance, perBoundary, boundary.point);
+  const double near = perBoundary * size.lc / root3;  // farther ones do not limit l_c
+  const Gap boundary = gapWithin(S.tree, M.x, patchFaces(M), near);
+  if (boundary.triangle >= 0)
+    limit("the distance of S to the boundary", boundary.distance, perBoundary, boundary.point);
   for (const Parametrization& earlier : M.surfaces) {
-    const Gap gap = smallestGap(S.tree, earlier.points, earlier.triangles);
-    limit("the distance of S to the surface '" + earlier.name + "'", gap.distance, perSurface,
-          gap.point);
+    const Gap gap = gapWithin(S.tree, earlier.points, earlier.triangles, near);
+    if (gap.triangle >= 0)
+      limit("the distance of S to the surface '" + earlier.name + "'", gap.distance, perSurface,
+            gap.point);
   }
   return size;
 }
@@ -6284,7 +6295,7 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   std::vector<std::array<int, 3>> boundary;
   for (std::size_t p = 1; p <= M.patches.size(); ++p)
     for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) boundary.push_back(face);
-  const Gap gap = smallestGap(S.tree, M.x, boundary);
+  const Gap gap = gapWithin(S.tree, M.x, boundary, aboveDiagonal * lc);
   if (gap.distance <= 0 || !contains(M, S.S.points[0]))
     throw InputError("insertSurface (§3.1): S touches or leaves the domain" +
                      (gap.distance <= 0 ? at(gap) : std::string()) + "; it must lie inside");
@@ -6628,8 +6639,8 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
 /// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
 /// come nearer.
 void checkFacesApart(Insertion& I) {
-  const Gap gap = smallestGap(I.S.tree, I.M.x, facesAround(I.M, I.S, 0));
-  if (gap.triangle < 0 || gap.distance > 0) return;
+  const Gap gap = gapWithin(I.S.tree, I.M.x, facesAround(I.M, I.S, 0), DBL_MIN);
+  if (gap.triangle < 0) return;
   I.isBlocked = true;
   throw MethodError("insertSurface (§3.2): S crosses the faces of an earlier surface" + at(gap) +
                     "; lower l_c");
@@ -6861,9 +6872,9 @@ std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S) {
 void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
   auto check = [](const Candidate& S, const std::string& other, const std::vector<Vec3>& points,
                   const std::vector<std::array<int, 3>>& triangles) {
-    const Gap gap = smallestGap(S.S.tree, points, triangles);
     const TriangleTree::Box& box = S.S.tree.nodes[0].box;
-    if (gap.distance <= touching * norm(box.hi - box.lo))
+    const Gap gap = gapWithin(S.S.tree, points, triangles, touching * norm(box.hi - box.lo));
+    if (gap.triangle >= 0)
       throw InputError("insertSurfaces (§3.1): " + (S.label.empty() ? "S" : S.label) + " and " +
                        other + " cross or touch" + at(gap) +
                        "; surfaces must not meet: cut one back, or leave one out");
