@@ -3769,7 +3769,8 @@ void keepNearerOnEdge(Vec3 x, const std::array<Vec3, 3>& corner, int i, ClosestP
 /// Distance of two boxes, 0 where they meet; a point is a box too.
 double boxDistance(const TriangleTree::Box& a, const TriangleTree::Box& b) {
   const Vec3 after = a.lo - b.hi, before = b.lo - a.hi;
-  return norm(Vec3{std::max(std::max(after.x, before.x), 0.), std::max(std::max(after.y, before.y), 0.),
+  return norm(Vec3{std::max(std::max(after.x, before.x), 0.),
+                   std::max(std::max(after.y, before.y), 0.),
                    std::max(std::max(after.z, before.z), 0.)});
 }
 
@@ -5318,6 +5319,10 @@ struct SurfaceComplex {
     for (const auto& [a, b] : edgeList)
       if (isRimEdge(a, b)) node[a] = node[b] = 2;
   }
+  /// The vertices of a tetrahedron on S_M.
+  int count(const std::array<int, 4>& z) const {
+    return (node[z[0]] > 0) + (node[z[1]] > 0) + (node[z[2]] > 0) + (node[z[3]] > 0);
+  }
   bool isEdge(int a, int b) const { return edges.get(edgeKey(a, b)) > 0; }
   bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 2; }
 };
@@ -5348,7 +5353,7 @@ bool refineFacesWithTwoRimEdges(Bisection& B, int k) {
   const SurfaceComplex SM(B.M, k);
   std::vector<std::pair<int, int>> refine;
   for (const std::array<int, 4>& z : B.M.tets)
-    for (int i = 0; i < 4; ++i) {
+    for (int i = 0; i < 4 && SM.count(z) > 2; ++i) {
       const std::array<int, 3> v = faceOpposite(z, i);
       if (SM.node[v[0]] != 2 || SM.node[v[1]] != 2 || SM.node[v[2]] != 2) continue;
       int rimEdges = 0;
@@ -5384,6 +5389,7 @@ bool refineToFullSubcomplex(Bisection& B, int k) {
   std::vector<std::pair<int, int>> refine;
   for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
     const std::array<int, 4>& z = B.M.tets[E];
+    if (SM.count(z) < 2) continue;
     for (const auto& e : tetEdges)
       if (SM.node[z[e[0]]] && SM.node[z[e[1]]] && !SM.isEdge(z[e[0]], z[e[1]]))
         refine.push_back({z[e[0]], z[e[1]]});
@@ -6340,13 +6346,13 @@ struct Insertion {
   const InsertOptions& options;
   int k;         // number of the new surface
   bool crosses;  // S itself
-  Mesh M = {};  // refined by §3.2 and §3.3
+  Mesh M = {};   // refined by §3.2 and §3.3
   Approximation A = {};
   SquareSurface Q = {};
   Survey survey = {};
   SurfaceParametrization Phi = {};  // of S, once the first way needs it
-  int ways = 0;    // tried so far, over all l_c
-  int faults = 0;  // and left; why the last one was, without prefix and advice
+  int ways = 0;                     // tried so far, over all l_c
+  int faults = 0;                   // and left; why the last one was, without prefix and advice
   std::string reason = {};
   bool isBlocked = false;   // at this l_c, by an earlier surface
   bool wasBlocked = false;  // at some l_c
@@ -6889,10 +6895,12 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
 }
 
 /// 3.2 to 3.7 for one surface, at the sizes that are to be tried.
-InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
+///   original  the statistics of M
+InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options,
+                             const QualityStatistics& original) {
   const SurfaceDistance& cleaned = candidate.S;
   InsertReport report;
-  report.original = qualityStatistics(M);
+  report.original = original;
 
   SizeChoice chosen;
   Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
@@ -6929,35 +6937,40 @@ void largestFirst(std::vector<Candidate>& all) {
                    [&](const Candidate& a, const Candidate& b) { return key(a) < key(b); });
 }
 
-/// What an insertion asks of the mesh and the options before it looks at a surface.
-void checkStart(const Mesh& M, const InsertOptions& options) {
+/// What an insertion asks of the mesh and the options before it looks at a surface. Returns the
+/// statistics of M.
+QualityStatistics checkStart(const Mesh& M, const InsertOptions& options) {
   checkMeccano(M, "insertSurface (§3.1)");
   checkOptions(options, M.x.size());
-  const int inverted = qualityStatistics(M).inverted;
-  if (inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(inverted) +
+  const QualityStatistics q = qualityStatistics(M);
+  if (q.inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(q.inverted) +
                      " inverted elements; untangle it first (optimizeMesh)");
+  return q;
 }
 
 }  // namespace
 
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
-  checkStart(M, options);
+  const QualityStatistics original = checkStart(M, options);
   const Candidate one = candidateOf(S, "");
   checkApart(M, {one});
-  return insertCandidate(M, one, options);
+  return insertCandidate(M, one, options, original);
 }
 
 std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
                                          const InsertOptions& options) {
-  checkStart(M, options);
+  QualityStatistics q = checkStart(M, options);
   std::vector<Candidate> all = candidatesOf(S);
   checkApart(M, all);
   largestFirst(all);
   Mesh result = M;
   std::vector<InsertReport> reports;
-  for (const Candidate& one : all)
-    reports.push_back(labelled(one.label, [&] { return insertCandidate(result, one, options); }));
+  for (const Candidate& one : all) {
+    reports.push_back(
+        labelled(one.label, [&] { return insertCandidate(result, one, options, q); }));
+    q = reports.back().smoothed;
+  }
   for (std::size_t i = 0; i + 1 < all.size();
        ++i)  // later ones have refined and moved earlier ones
     labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i]); });
