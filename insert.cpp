@@ -4,6 +4,7 @@
 // approximation and its healing, surface extraction and its healing, surface projection; and
 // insertSurface, which calls them in the paper's order. Section 3.7 is optimize.cpp.
 #include <algorithm>
+#include <cfloat>
 #include <cstdint>
 #include <cstdio>
 #include <map>
@@ -4061,11 +4062,11 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
   return largest;
 }
 
-}  // namespace
-
-Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
-                const std::vector<std::array<int, 3>>& triangles) {
-  Gap gap{beyondAll, -1, -1, {}};
+/// smallestGap() where it is below `within`; else no triangle, and that distance. Other triangles
+/// are then passed over by their boxes.
+Gap gapWithin(const TriangleTree& tree, const std::vector<Vec3>& points,
+              const std::vector<std::array<int, 3>>& triangles, double within) {
+  Gap gap{within, -1, -1, {}};
   for (std::size_t o = 0; o < triangles.size() && !tree.nodes.empty(); ++o) {
     const std::array<int, 3>& v = triangles[o];
     const std::array<Vec3, 3> other{points[v[0]], points[v[1]], points[v[2]]};
@@ -4078,6 +4079,13 @@ Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
     });
   }
   return gap;
+}
+
+}  // namespace
+
+Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
+                const std::vector<std::array<int, 3>>& triangles) {
+  return gapWithin(tree, points, triangles, beyondAll);
 }
 
 std::vector<Crossing> selfCrossings(const TriangleSurface& S) {
@@ -4353,12 +4361,15 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
       !selfCrossings(S.S).empty())
     size.lc = size.finest = 2 * diagonal * aboveDiagonal;
 
-  const Gap boundary = smallestGap(S.tree, M.x, patchFaces(M));
-  limit("the distance of S to the boundary", boundary.distance, perBoundary, boundary.point);
+  const double near = perBoundary * size.lc / root3;  // farther ones do not limit l_c
+  const Gap boundary = gapWithin(S.tree, M.x, patchFaces(M), near);
+  if (boundary.triangle >= 0)
+    limit("the distance of S to the boundary", boundary.distance, perBoundary, boundary.point);
   for (const Parametrization& earlier : M.surfaces) {
-    const Gap gap = smallestGap(S.tree, earlier.points, earlier.triangles);
-    limit("the distance of S to the surface '" + earlier.name + "'", gap.distance, perSurface,
-          gap.point);
+    const Gap gap = gapWithin(S.tree, earlier.points, earlier.triangles, near);
+    if (gap.triangle >= 0)
+      limit("the distance of S to the surface '" + earlier.name + "'", gap.distance, perSurface,
+            gap.point);
   }
   return size;
 }
@@ -5359,6 +5370,10 @@ struct SurfaceComplex {
     for (const auto& [a, b] : edgeList)
       if (isRimEdge(a, b)) node[a] = node[b] = 2;
   }
+  /// The vertices of a tetrahedron on S_M.
+  int count(const std::array<int, 4>& z) const {
+    return (node[z[0]] > 0) + (node[z[1]] > 0) + (node[z[2]] > 0) + (node[z[3]] > 0);
+  }
   bool isEdge(int a, int b) const { return edges.get(edgeKey(a, b)) > 0; }
   bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 2; }
 };
@@ -5389,7 +5404,7 @@ bool refineFacesWithTwoRimEdges(Bisection& B, int k) {
   const SurfaceComplex SM(B.M, k);
   std::vector<std::pair<int, int>> refine;
   for (const std::array<int, 4>& z : B.M.tets)
-    for (int i = 0; i < 4; ++i) {
+    for (int i = 0; i < 4 && SM.count(z) > 2; ++i) {
       const std::array<int, 3> v = faceOpposite(z, i);
       if (SM.node[v[0]] != 2 || SM.node[v[1]] != 2 || SM.node[v[2]] != 2) continue;
       int rimEdges = 0;
@@ -5425,6 +5440,7 @@ bool refineToFullSubcomplex(Bisection& B, int k) {
   std::vector<std::pair<int, int>> refine;
   for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
     const std::array<int, 4>& z = B.M.tets[E];
+    if (SM.count(z) < 2) continue;
     for (const auto& e : tetEdges)
       if (SM.node[z[e[0]]] && SM.node[z[e[1]]] && !SM.isEdge(z[e[0]], z[e[1]]))
         refine.push_back({z[e[0]], z[e[1]]});
@@ -6336,7 +6352,7 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   std::vector<std::array<int, 3>> boundary;
   for (std::size_t p = 1; p <= M.patches.size(); ++p)
     for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) boundary.push_back(face);
-  const Gap gap = smallestGap(S.tree, M.x, boundary);
+  const Gap gap = gapWithin(S.tree, M.x, boundary, aboveDiagonal * lc);
   if (gap.distance <= 0 || !contains(M, S.S.points[0]))
     throw InputError("insertSurface (§3.1): S touches or leaves the domain" +
                      (gap.distance <= 0 ? at(gap) : std::string()) + "; it must lie inside");
@@ -6688,8 +6704,8 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
 /// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
 /// come nearer.
 void checkFacesApart(Insertion& I) {
-  const Gap gap = smallestGap(I.S.tree, I.layer.M.x, facesAround(I.layer.M, I.S, 0));
-  if (gap.triangle < 0 || gap.distance > 0) return;
+  const Gap gap = gapWithin(I.S.tree, I.layer.M.x, facesAround(I.layer.M, I.S, 0), DBL_MIN);
+  if (gap.triangle < 0) return;
   I.isBlocked = true;
   throw MethodError("insertSurface (§3.2): S crosses the faces of an earlier surface" + at(gap) +
                     "; lower l_c");
@@ -6963,9 +6979,9 @@ std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S) {
 void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
   auto check = [](const Candidate& S, const std::string& other, const std::vector<Vec3>& points,
                   const std::vector<std::array<int, 3>>& triangles) {
-    const Gap gap = smallestGap(S.S.tree, points, triangles);
     const TriangleTree::Box& box = S.S.tree.nodes[0].box;
-    if (gap.distance <= touching * norm(box.hi - box.lo))
+    const Gap gap = gapWithin(S.S.tree, points, triangles, touching * norm(box.hi - box.lo));
+    if (gap.triangle >= 0)
       throw InputError("insertSurfaces (§3.1): " + (S.label.empty() ? "S" : S.label) + " and " +
                        other + " cross or touch" + at(gap) +
                        "; surfaces must not meet: cut one back, or leave one out");
@@ -6980,10 +6996,12 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
 }
 
 /// 3.2 to 3.7 for one surface, at the sizes that are to be tried.
-InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options) {
+///   original  the statistics of M
+InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options,
+                             const QualityStatistics& original) {
   const SurfaceDistance& cleaned = candidate.S;
   InsertReport report;
-  report.original = qualityStatistics(M);
+  report.original = original;
 
   SizeChoice chosen;
   Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
@@ -7020,35 +7038,40 @@ void largestFirst(std::vector<Candidate>& all) {
                    [&](const Candidate& a, const Candidate& b) { return key(a) < key(b); });
 }
 
-/// What an insertion asks of the mesh and the options before it looks at a surface.
-void checkStart(const Mesh& M, const InsertOptions& options) {
+/// What an insertion asks of the mesh and the options before it looks at a surface. Returns the
+/// statistics of M.
+QualityStatistics checkStart(const Mesh& M, const InsertOptions& options) {
   checkMeccano(M, "insertSurface (§3.1)");
   checkOptions(options, M.x.size());
-  const int inverted = qualityStatistics(M).inverted;
-  if (inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(inverted) +
+  const QualityStatistics q = qualityStatistics(M);
+  if (q.inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(q.inverted) +
                      " inverted elements; untangle it first (optimizeMesh)");
+  return q;
 }
 
 }  // namespace
 
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
-  checkStart(M, options);
+  const QualityStatistics original = checkStart(M, options);
   const Candidate one = candidateOf(S, "");
   checkApart(M, {one});
-  return insertCandidate(M, one, options);
+  return insertCandidate(M, one, options, original);
 }
 
 std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
                                          const InsertOptions& options) {
-  checkStart(M, options);
+  QualityStatistics q = checkStart(M, options);
   std::vector<Candidate> all = candidatesOf(S);
   checkApart(M, all);
   largestFirst(all);
   Mesh result = M;
   std::vector<InsertReport> reports;
-  for (const Candidate& one : all)
-    reports.push_back(labelled(one.label, [&] { return insertCandidate(result, one, options); }));
+  for (const Candidate& one : all) {
+    reports.push_back(
+        labelled(one.label, [&] { return insertCandidate(result, one, options, q); }));
+    q = reports.back().smoothed;
+  }
   for (std::size_t i = 0; i + 1 < all.size();
        ++i)  // later ones have refined and moved earlier ones
     labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i]); });

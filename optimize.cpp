@@ -1637,16 +1637,17 @@ bool untangleAndSmooth(Smoother& S) {
 
 constexpr double worstFraction = .004;  // of the elements count as the worst ones,
 constexpr std::size_t worstCount = 10;  // but at least so many
-constexpr int liftRounds = 15, liftSweeps = 4, lastSweeps = 8;
+constexpr int liftRounds = 25, liftSweeps = 4, lastSweeps = 8;
 constexpr double liftMeanLoss =
     .015;  // of mean q: the rounds end there (the last one wins most back),
 constexpr double liftMinGain = .002;  // or where the lowest q rises by less
+constexpr double perfect = .9995;     // a lowest q that is not lifted
 constexpr int idleRounds = 2;         // in so many rounds
 constexpr double lowQuality = .45;    // below it the lift has patience:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
 constexpr double liftMaxDisp = 1e-3;  // relative to the shortest edge: a round's sweeps end there
-constexpr double liftWake = .05;  // unrest for a visit, also in the last round: only what happens
-                                  // near the worst counts
+constexpr double liftWake = .05;   // unrest for a visit, also in the last round: only what happens
+                                   // near the worst counts
 constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
                                    // an element's nodes are not visited again
 /// η_w at least: of η of the worst. 1.07^64 = 76: these outweigh all others; with far less of them
@@ -1715,7 +1716,7 @@ void liftWorst(Smoother& S) {
   S.moved.assign(S.moved.size(), 1);
   updateWorst(S, worst);
   const double meanAtStart = worst.mean;
-  if (worst.lowest > 1 - liftMinGain) return;
+  if (worst.lowest > perfect) return;
   double highest = worst.lowest;
   for (int round = 0, idle = 0; sweepsLeft(S); ++round) {
     const bool low = worst.lowest < lowQuality;
@@ -1816,9 +1817,10 @@ void checkElements(const Mesh& M) {
                ", but nodes are 0 to " + std::to_string(nodes - 1));
     if (M.xi.empty()) continue;
     const std::array<Vec3, 4> z = cornersOf(M.xi, M.tets[E]);
-    double longest = 0;
-    for (const Vec3& a : z)
-      for (const Vec3& b : z) longest = std::max(longest, norm(a - b));
+    double longest2 = 0;
+    for (int i = 1; i < 4; ++i)
+      for (int j = 0; j < i; ++j) longest2 = std::max(longest2, norm2(z[i] - z[j]));
+    const double longest = std::sqrt(longest2);
     if (!(std::abs(signedVolume6(z)) > degenerateIdeal * longest * longest * longest))
       refuse("tetrahedron " + std::to_string(E) +
              ": its ideal element is degenerate; correct M.xi");

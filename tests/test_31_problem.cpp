@@ -346,6 +346,23 @@ TEST_SUITE("3.2") {
     CHECK(smallestGap(tree, {{0, -5, -1}, {0, 5, -1}, {0, 1, 3}}, {{0, 1, 2}}).distance == 0);
   }
 
+  TEST_CASE("Hausdorff distance is the largest of all samples, though few are searched for") {
+    const TriangleSurface A = bentGrid(9, 7), B = bentGrid(23, 17);
+    const TriangleTree treeA(A.points, A.triangles), treeB(B.points, B.triangles);
+    constexpr int m = 4;
+    double largest = 0;
+    for (const auto& [from, to] : {std::make_pair(&treeA, &treeB), std::make_pair(&treeB, &treeA)})
+      for (const std::array<Vec3, 3>& c : from->corners)
+        for (int i = 0; i <= m; ++i)
+          for (int j = 0; i + j <= m; ++j) {
+            const Vec3 p =
+                (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
+            largest = std::max(largest, to->closest(p).distance);
+          }
+    CHECK(largest > 1e-3);
+    CHECK(hausdorffDistance(treeA, treeB, m) == doctest::Approx(largest).epsilon(1e-12));
+  }
+
   TEST_CASE("Hausdorff distance is two-sided") {
     TriangleTree small({{0, 0, 0}, {1, 0, 0}, {0, 1, 0}}, {{0, 1, 2}});
     TriangleTree large({{0, 0, .5}, {3, 0, .5}, {0, 3, .5}}, {{0, 1, 2}});

@@ -265,9 +265,9 @@ TEST_SUITE("3.4") {
       const auto meanDistance = [&](int side) {
         const Extraction X = surfaceExtraction(I.M, I.Q, I.S, side, Outline::squares);
         REQUIRE(X.fault == "");
-        double most = 0;
-        for (int n : cornersOf(I.Q, X.selected))
-          most = std::max(most, I.S.query(I.M.x[n]).distance);
+        double sum = 0;
+        const std::set<int> corners = cornersOf(I.Q, X.selected);
+        for (int n : corners) sum += I.S.query(I.M.x[n]).distance;
         for (std::size_t i = 0; i < I.Q.squares.size(); ++i)
           if (X.selected[i] && side == 0) {
             CHECK(I.S.query(I.Q.squares[i].beyond).side >= 0);

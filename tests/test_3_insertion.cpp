@@ -368,6 +368,23 @@ TEST_SUITE("3") {
     CHECK(report.hausdorff <= .5 * report.lc);
   }
 
+  TEST_CASE("insertion: a way that stays tangled waits, and a better one is taken") {
+    const Mesh before = boxMesh({0, 0, 0}, {1, 1, 1}, {5, 5, 5});
+    const TriangleSurface S = samples::sine2(.1);
+    Mesh M = before;
+    std::vector<std::string> aside;
+    InsertOptions options = withSize(.06);
+    options.onProgress = [&](const std::string& line) {
+      if (has(line, "put aside")) aside.push_back(line);
+    };
+    const InsertReport report = insertSurface(M, S, options);
+    checkPromises(before, M, S, 1, report, 1e-12 * shapes::diagonal(S));
+    REQUIRE(aside.size() == 1);
+    CHECK(has(aside[0], "half squares"));
+    CHECK(report.way == 2);
+    CHECK(report.smoothed.min > .5);
+  }
+
   TEST_CASE("insertion: a tolerance is met by the coarsest level of the bisection that does it") {
     const TriangleSurface S = samples::sine(.1, 24);
     for (double E : {.03, .006}) {
