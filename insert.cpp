@@ -6581,6 +6581,9 @@ constexpr double poorHausdorff = .3, poorWorth = .6;
 
 constexpr double badHausdorff = .45;  // [choice] of l_c: refused
 
+/// [choice] A way is better than another one where its lowest q is higher by more.
+constexpr double betterBy = .01;
+
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
   constexpr double poorShift = 2;  // [choice] of h: warned of
@@ -6635,8 +6638,8 @@ std::vector<std::array<int, 3>> farFaces(const Mesh& M, const SurfaceDistance& S
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int steps = std::max(distanceSamples, static_cast<int>(std::ceil(longest / spacing)));
     for (Vec3 w : latticeOn(steps, [&](Vec3 p) { return !isWithin(tree, at(c, p), allowed); })) {
-      const int face = locate(PM, w.x * P.u[t[0]] + w.y * P.u[t[1]] + w.z * P.u[t[2]]).triangle;
-      if (face >= 0) isFar[face] = 1;
+      const int inU = locate(PM, w.x * P.u[t[0]] + w.y * P.u[t[1]] + w.z * P.u[t[2]]).triangle;
+      isFar[inU >= 0 ? inU : tree.closest(at(c, w)).triangle] = 1;  // beyond the rim the nearest
     }
   }
   std::vector<std::array<int, 3>> faces;
@@ -6652,19 +6655,20 @@ std::vector<std::array<int, 3>> farFaces(const Mesh& M, const SurfaceDistance& S
 /// as long as the distance falls. Finer cubes there alone, that is.
 void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
   constexpr int maxRounds = 6;
+  constexpr double wanted = .25;  // [choice] of l_c: with room to what is warned of
   const double lc = report.lc;
-  for (int round = 0; round < maxRounds && report.hausdorff > badHausdorff * lc; ++round) {
+  if (report.hausdorff <= badHausdorff * lc) return;
+  for (int round = 0; round < maxRounds && report.hausdorff > wanted * lc; ++round) {
     Mesh trial = M;
     Bisection B(trial);
     std::vector<int> active;
-    const std::size_t before = M.x.size();
-    for (const auto& face : farFaces(M, I.S, I.k, poorHausdorff * lc, distancePerLc * lc))
+    for (const auto& face : farFaces(M, I.S, I.k, wanted * lc, distancePerLc * lc))
       for (int e = 0; e < 3; ++e) {
         active.push_back(face[e]);
         B.bisectEdge(face[e], face[(e + 1) % 3]);
       }
     surfaceHealing(B, I.k);
-    for (std::size_t n = before; n < trial.x.size(); ++n) active.push_back(static_cast<int>(n));
+    for (std::size_t n = M.x.size(); n < trial.x.size(); ++n) active.push_back(static_cast<int>(n));
     InsertReport after = report;
     optimizeAround(trial, I, true, active, after);
     if (after.optimization.inverted > 0) return;
@@ -6673,14 +6677,13 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
     I.progress("3.7 refined where S_M is far from S: " + number(after.hausdorff / lc) + " l_c, " +
                std::to_string(trial.tets.size()) + " tetrahedra, min " +
                number(after.smoothed.min));
+    const bool enough = report.hausdorff <= badHausdorff * lc;  // then q may not fall for it
     if (after.hausdorff >= report.hausdorff) return;
+    if (enough && after.smoothed.min < report.smoothed.min - betterBy) return;
     after.optimization.sweeps += report.optimization.sweeps;
     M = std::move(trial), report = after;
   }
 }
-
-/// [choice] A way is better than another one where its lowest q is higher by more.
-constexpr double betterBy = .01;
 
 /// Follows one way; keeps its mesh and report where it is the best valid one so far.
 ///   returns  false: put aside
@@ -6753,7 +6756,7 @@ void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, Insert
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
   // [choice] nor, there, whole squares where S_M of half squares is far from S: theirs is as far
   auto isPoor = [&] {
-    return tets >= large && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
+    return tets >= huge && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
   };
   std::vector<Selection> tried;
   std::vector<Way> aside;
