@@ -1101,7 +1101,7 @@ class SheetBarrier {
 };
 
 SheetBarrier::SheetBarrier(const Smoother& S, int n) {
-  constexpr double weight = .1;  // [choice] of .003 to 1; all help alike
+  constexpr double weight = .03;  // [choice] of .003 to 1; all help alike
   if (!S.stuck || S.sheetStart.empty() || S.M.dimension[n] != 2) return;
   const Vec2 u = S.M.parameter[n];
   double sum = 0;
