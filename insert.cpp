@@ -6546,7 +6546,9 @@ constexpr int impatientSweeps = 5;
 /// these are loosened, as long as there are fewer inverted ones, or the lowest q rises. No global
 /// descent here: other ways of inserting S are cheaper.
 ///   patient  false: a mesh that is still tangled after a few sweeps is left as it is
-void optimizeAround(Mesh& M, const Insertion& I, bool patient, InsertReport& report) {
+///   active   the nodes to start from
+void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector<int>& active,
+                    InsertReport& report) {
   constexpr int maxRounds = 4;
   constexpr int patientSweeps = 150;  // while tangled, of a loosened mesh: few elements are left
   constexpr std::size_t few = 60;
@@ -6554,7 +6556,7 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, InsertReport& rep
   constexpr double narrow = 1.1, wide = 1.3;  // of the lowest q, then below more of it
   OptimizeOptions optimize = I.options.optimize;
   optimize.globalDescent = false;
-  optimize.active = nodesNear(M, I.k);
+  optimize.active = active;
   if (!patient) optimize.maxTangledSweeps = std::min(optimize.maxTangledSweeps, impatientSweeps);
   OptimizeReport& best = report.optimization;
   best = optimizeMesh(M, optimize);
@@ -6607,7 +6609,7 @@ bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertRepo
   report.projected = qualityStatistics(M);
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
-  optimizeAround(M, I, patient, report);
+  optimizeAround(M, I, patient, nodesNear(M, I.k), report);
   report.smoothed = qualityStatistics(M);
   I.progress("3.7 optimization: " + std::to_string(report.optimization.sweeps) + " sweeps, " +
              std::to_string(report.smoothed.inverted) + " inverted, min " +
@@ -6621,11 +6623,12 @@ bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertRepo
   return false;
 }
 
+constexpr int distanceSamples = 4;     // along the edges of triangles, for the Hausdorff distance
+constexpr double distancePerLc = .25;  // [choice] of l_c, between samples of large triangles of S
+
 /// The measures of S_M that the report promises.
 ///   errors  MethodError: a node of it is off S
 void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& report) {
-  constexpr int samples = 4;
-  constexpr double perLc = .25;  // [choice] samples of large triangles of S
   const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
   std::vector<char> on(M.x.size(), 0);
   report.nodes = 0, report.maxNodeDistance = 0;
@@ -6644,7 +6647,7 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
                       " away from S");
   report.triangles = static_cast<int>(faces.size());
   const Width farthest =
-      farthestPoint(TriangleTree(M.x, faces), S.tree, samples, perLc * report.lc);
+      farthestPoint(TriangleTree(M.x, faces), S.tree, distanceSamples, distancePerLc * report.lc);
   report.hausdorff = farthest.distance, report.hausdorffPlace = farthest.place;
 }
 
@@ -6652,10 +6655,14 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
 /// counts when ways are compared.
 constexpr double poorHausdorff = .3, poorWorth = .6;
 
+constexpr double badHausdorff = .45;  // [choice] of l_c: refused
+
+/// [choice] A way is better than another one where its lowest q is higher by more.
+constexpr double betterBy = .01;
+
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
-  constexpr double badHausdorff = .45;  // [choice] of l_c: refused
-  constexpr double poorShift = 2;       // [choice] of h: warned of
+  constexpr double poorShift = 2;  // [choice] of h: warned of
   const std::string found = "the Hausdorff distance S_M - S is " + number(report.hausdorff) +
                             " near " + placeText(report.hausdorffPlace);
   if (report.hausdorff > badHausdorff * report.lc)
@@ -6669,8 +6676,91 @@ void judgeSurface(double h, InsertReport& report) {
                               " along S, more than 2 cube edges; lower l_c");
 }
 
-/// [choice] A way is better than another one where its lowest q is higher by more.
-constexpr double betterBy = .01;
+/// The points of a lattice on the triangle, `steps` along its edges, for which far(w) holds: their
+/// barycentric coordinates.
+template <class Far>
+std::vector<Vec3> latticeOn(int steps, Far far) {
+  std::vector<Vec3> found;
+  for (int i = 0; i <= steps; ++i)
+    for (int j = 0; i + j <= steps; ++j) {
+      const Vec3 w = (1. / steps) * Vec3{double(steps - i - j), double(i), double(j)};
+      if (far(w)) found.push_back(w);
+    }
+  return found;
+}
+
+Vec3 at(const std::array<Vec3, 3>& c, Vec3 w) { return w.x * c[0] + w.y * c[1] + w.z * c[2]; }
+
+/// The faces of S_M that are farther than `allowed` from S somewhere, or whose part of 𝓤 belongs
+/// to points of S that are as far from S_M.
+std::vector<std::array<int, 3>> farFaces(const Mesh& M, const SurfaceDistance& S, int k,
+                                         double allowed, double spacing) {
+  const Parametrization& P = M.surfaces[k - 1];
+  const ApproximatingSurface SM = labelledSurface(M, k);
+  Parametrization PM;
+  PM.points = SM.S.points, PM.triangles = SM.S.triangles, PM.u.resize(SM.node.size());
+  for (std::size_t i = 0; i < SM.node.size(); ++i) parameterOn(M, SM.node[i], k, PM.u[i]);
+  buildLocator(PM);
+  const TriangleTree tree(PM.points, PM.triangles);
+  std::vector<char> isFar(PM.triangles.size(), 0);
+  for (std::size_t t = 0; t < isFar.size(); ++t) {
+    const std::array<Vec3, 3> c = cornersOf(SM.S, static_cast<int>(t));
+    isFar[t] = !latticeOn(distanceSamples, [&](Vec3 w) {
+                  return triangleWithin(S.tree, at(c, w), allowed) < 0;
+                }).empty();
+  }
+  for (const std::array<int, 3>& t : P.triangles) {
+    const std::array<Vec3, 3> c{P.points[t[0]], P.points[t[1]], P.points[t[2]]};
+    const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
+    const int steps = std::max(distanceSamples, static_cast<int>(std::ceil(longest / spacing)));
+    for (Vec3 w :
+         latticeOn(steps, [&](Vec3 p) { return triangleWithin(tree, at(c, p), allowed) < 0; })) {
+      const int inU = locate(PM, w.x * P.u[t[0]] + w.y * P.u[t[1]] + w.z * P.u[t[2]]).triangle;
+      isFar[inU >= 0 ? inU : tree.closest(at(c, w)).triangle] = 1;  // beyond the rim the nearest
+    }
+  }
+  std::vector<std::array<int, 3>> faces;
+  for (std::size_t t = 0; t < isFar.size(); ++t) {
+    const std::array<int, 3>& v = PM.triangles[t];
+    if (isFar[t]) faces.push_back({SM.node[v[0]], SM.node[v[1]], SM.node[v[2]]});
+  }
+  return faces;
+}
+
+/// [departure] Where S_M passes over a pit of S, or a fin, that is narrower than the cubes, so that
+/// it would be refused: the edges of its faces there are bisected, and the mesh is smoothed again,
+/// as long as the distance falls. Finer cubes there alone, that is.
+void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
+  constexpr int maxRounds = 6;
+  constexpr double wanted = .25;  // [choice] of l_c: with room to what is warned of
+  const double lc = report.lc;
+  if (report.hausdorff <= badHausdorff * lc) return;
+  for (int round = 0; round < maxRounds && report.hausdorff > wanted * lc; ++round) {
+    Mesh trial = M;
+    Bisection B(trial);
+    std::vector<int> active;
+    for (const auto& face : farFaces(M, I.S, I.k, wanted * lc, distancePerLc * lc))
+      for (int e = 0; e < 3; ++e) {
+        active.push_back(face[e]);
+        B.bisectEdge(face[e], face[(e + 1) % 3]);
+      }
+    surfaceHealing(B, I.k);
+    for (std::size_t n = M.x.size(); n < trial.x.size(); ++n) active.push_back(static_cast<int>(n));
+    InsertReport after = report;
+    optimizeAround(trial, I, true, active, after);
+    if (after.optimization.inverted > 0) return;
+    after.smoothed = qualityStatistics(trial);
+    measureSurface(trial, I.S, after);
+    I.progress("3.7 refined where S_M is far from S: " + number(after.hausdorff / lc) + " l_c, " +
+               std::to_string(trial.tets.size()) + " tetrahedra, min " +
+               number(after.smoothed.min));
+    const bool enough = report.hausdorff <= badHausdorff * lc;  // then q may not fall for it
+    if (after.hausdorff >= report.hausdorff) return;
+    if (enough && after.smoothed.min < report.smoothed.min - betterBy) return;
+    after.optimization.sweeps += report.optimization.sweeps;
+    M = std::move(trial), report = after;
+  }
+}
 
 /// Follows one way; keeps its mesh and report where it is the best valid one so far.
 ///   returns  false: put aside
@@ -6685,6 +6775,7 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
     measureSurface(trial, I.S, ofThisWay);
     I.progress("S_M: Hausdorff distance " + number(ofThisWay.hausdorff) + ", " +
                number(ofThisWay.hausdorff / lc) + " l_c");
+    refineFarFaces(I, trial, ofThisWay);
     judgeSurface(I.layer.Q.h, ofThisWay);
   } catch (const MethodError& error) {
     I.leave(describe(way), error);
@@ -6749,14 +6840,14 @@ double goodQuality(std::size_t tets) { return tets < 50000 ? .6 : tets < 200000 
 
 /// The ways of a layer until one is good; those put aside because they stay tangled are returned.
 std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& report) {
-  constexpr std::size_t large = 50000;
+  constexpr std::size_t huge = 200000;
   const std::size_t tets = I.layer.M.tets.size();
   const bool isPaper = I.options.outline == Outline::paper;
   const double good = std::min(goodQuality(tets), report.original.min);
   auto isGood = [&] { return report.surface > 0 && (I.lowest >= good || isPaper); };
   // [choice] nor, there, whole squares where S_M of half squares is far from S: theirs is as far
   auto isPoor = [&] {
-    return tets >= large && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
+    return tets >= huge && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
   };
   std::vector<Outline> outlines{I.options.outline};
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);

@@ -669,6 +669,7 @@ struct Smoother {
 
   double delta = 0;      // of the sweep, relative to the mean σ
   bool tangled = false;  // of the mesh, and the rung of the schedule for μ
+  bool stuck = false;    // still, after some sweeps
   int rung = 0;
   double relaxation = 1;
   Penalty penalty = plainEta;
@@ -1072,6 +1073,59 @@ bool staysUnfolded(Smoother& S, int n, Vec2 parameter) {
   return unfolded;
 }
 
+/// [departure] Nodes that press against each other's triangles end in ones without area in 𝓤, whose
+/// edges stop every step (`staysUnfolded`) although there is a way along them. So while the mesh
+/// stays tangled each triangle of an inner surface node adds the mean of them over its own area to
+/// f, by a small weight: a node slides along what it cannot pass.
+class SheetBarrier {
+ public:
+  SheetBarrier(const Smoother& S, int n);
+  /// Its value with the node's parameter changed by p.
+  double value(Vec2 p) const {
+    double sum = 0;
+    for (const Term& t : terms_) {
+      const double area = t.area + t.slope.x * p.x + t.slope.y * p.y;
+      sum += area > 0 ? scale_ / area : unbounded;
+    }
+    return sum;
+  }
+  void addTo(Objective& o) const;
+
+ private:
+  struct Term {
+    double area;  // twice, in 𝓤
+    Vec2 slope;   // of area, in the node's parameter
+  };
+  std::vector<Term> terms_;
+  double scale_ = 0;
+};
+
+SheetBarrier::SheetBarrier(const Smoother& S, int n) {
+  constexpr double weight = .03;  // [choice] of .003 to 1; all help alike
+  if (!S.stuck || S.sheetStart.empty() || S.M.dimension[n] != 2) return;
+  const Vec2 u = S.M.parameter[n];
+  double sum = 0;
+  for (int k = S.sheetStart[n]; k < S.sheetStart[n + 1]; ++k) {
+    const SheetTriangle& t = S.sheet[k];
+    Vec2 a, b;
+    if (!parameterOn(S.M, t.a, t.label, a) || !parameterOn(S.M, t.b, t.label, b)) continue;
+    const double area = cross(a - u, b - u);
+    sum += std::abs(area);
+    if (area > 0) terms_.push_back({area, {a.y - b.y, b.x - a.x}});
+  }
+  scale_ = weight * sum / std::max(1, S.sheetStart[n + 1] - S.sheetStart[n]);
+}
+
+void SheetBarrier::addTo(Objective& o) const {
+  for (const Term& t : terms_) {
+    const double f = scale_ / t.area, x = t.slope.x / t.area, y = t.slope.y / t.area;
+    o.f += f;
+    o.gradient += Vec3{-f * x, -f * y, 0};
+    o.hessian =
+        o.hessian + Mat3{{2 * f * x * x, 2 * f * x * y, 0}, {2 * f * x * y, 2 * f * y * y, 0}, {}};
+  }
+}
+
 /// Step of the paper's differences, relative to the shortest edge. Second derivatives have errors
 /// of 1e-8 by truncation and by cancellation.
 constexpr double differenceStep = 1e-4;
@@ -1092,15 +1146,19 @@ double visitSliding(Smoother& S, int n, const Visit& visit, const Edges& edges) 
   const Mat3& D = here.derivative;
   const int count = S.M.dimension[n];
   Place at = here;
+  const SheetBarrier barrier(S, n);
   const auto F = [&](Vec2 change) {
     at = placeOf(S.M, n, u + change);
-    return at.inside ? valueAt(star, at.x - x, visit.delta, S.penalty) : unbounded;
+    if (!at.inside) return unbounded;
+    return valueAt(star, at.x - x, visit.delta, S.penalty) + barrier.value(change);
   };
   const double e = differenceStep * edges.shortest;
   const auto derivatives = [&](double leastSlope) {
-    return S.options.numericalDerivatives
-               ? byDifferences(F, count, {e / norm(D.c0), e / norm(D.c1)})
-               : inParameters(objectiveOf(star, visit.delta, S.penalty, leastSlope), D, count);
+    if (S.options.numericalDerivatives)
+      return byDifferences(F, count, {e / norm(D.c0), e / norm(D.c1)});
+    Objective o = inParameters(objectiveOf(star, visit.delta, S.penalty, leastSlope), D, count);
+    barrier.addTo(o);
+    return o;
   };
   const Objective o = derivatives(-1);
   const Direction d = descentDirection(o, derivatives, D, edges.longest);
@@ -1580,6 +1638,9 @@ constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while t
 constexpr int hopelessSweeps = 10, hopelessCount = 60;
 constexpr double hopelessPart = .1;
 
+/// [choice] Most meshes are valid after so many; then the nodes of sheets keep apart.
+constexpr int easySweeps = 10;
+
 /// μ of the sweep: the next rung where the number of inverted elements does not fall.
 struct MuSchedule {
   int rung = 0, fewest = std::numeric_limits<int>::max(), waited = 0, tangledSweeps = 0;
@@ -1621,6 +1682,7 @@ bool untangleAndSmooth(Smoother& S) {
     }
     S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted)) : 0;
     S.tangled = tangled;
+    S.stuck = tangled && schedule.tangledSweeps > easySweeps;
     S.rung = schedule.rung;
     const bool accelerated = !tangled && S.options.acceleration > 0;
     if (accelerated) acceleration.beforeSweep();

@@ -606,6 +606,29 @@ TEST_SUITE("3") {
     CHECK(cubeLevel(M, 1e-300) <= 255);  // ends
   }
 
+  TEST_CASE("failure: what is outside, too near, too small or too much is told with its numbers") {
+    const TriangleSurface S = samples::sine(.1, 16);
+    auto refused = [&](const TriangleSurface& of, const InsertOptions& options,
+                       const std::vector<std::string>& words) {
+      Mesh M = unitBox();
+      const std::string text = refusal(M, of, options, true);
+      for (const std::string& word : words) CHECK_MESSAGE(has(text, word), text);
+    };
+    const InsertOptions options = withSize(.14);
+    refused(placed(S, {.5, 0, 0}, 1), options,
+            {"S touches or leaves the domain at triangle ", " near (", "it must lie inside"});
+    refused(placed(S, {2, 0, 0}, 1), options, {"S touches or leaves the domain; it must"});
+    refused(S, withSize(.6), {"l_c = 0.6 is not below dist(∂M, S) = 0.", "near (", "lower l_c"});
+    refused(placed(S, {.45, .45, .45}, .1), options,
+            {"S, of extent 0.", "smaller than two cubes of edge", "lower l_c to 0."});
+    InsertOptions few = options;
+    few.maxTets = 100;
+    refused(S, few, {"l_c = 0.14 asks for about", "above the limit of 100; raise l_c"});
+    InsertOptions many = withSize(1e-6);
+    many.maxTets = 500000000;
+    refused(placed(S, {.5, .5, .5}, 2e-5), many, {"is below 1/500000 of the domain; raise l_c"});
+  }
+
   TEST_CASE("failure: an optimization that may not end is refused, and the mesh stays as it was") {
     Mesh M = unitBox();
     InsertOptions options = withSize(.14, InsertOptions::paper());
