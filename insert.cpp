@@ -6540,7 +6540,7 @@ std::vector<int> loosen(Mesh& M, const std::vector<int>& elements, int k) {
 
 /// [choice] Tangled sweeps after which a way is put aside while there are others: most are valid
 /// after 1 to 4, and those that need more are seldom better in the end (by .01 in the lowest q).
-constexpr int impatientSweeps = 5;
+constexpr int impatientSweeps = 12;
 
 /// §3.7, and [departure] where a few elements stay inverted, or poor as where S_M bridges a slit:
 /// these are loosened, as long as there are fewer inverted ones, or the lowest q rises. No global

@@ -39,6 +39,8 @@ struct Figures {
 struct Layers {
   std::vector<double> heights = {};  // in the order of their insertion; empty: none
   int smoothed = 0;                  // times 3 x 3, the heights that are lifted
+  std::array<int, 3> cells = {};     // of the terrain, that bisection takes to about 400 m
+  double lc = 0;                     // below the layers' distance, on steep ground
 };
 
 /// One call of meccanoMesher, insertions, and what must come of it.
@@ -106,16 +108,23 @@ void addTerrains(std::vector<Row>& all) {
     row.top = top;
     all.push_back(row);
   }
-  const std::pair<const char*, Figures> layers[] = {{"dem_gran_canaria_east.asc", {.32, .96, .06}},
-                                                    {"dem_el_hierro.asc", {.25, .95}}};
+  struct Region {
+    const char* file;
+    Figures figures;
+    std::array<int, 3> cells;
+    double lc;
+  };
+  const Region regions[] = {{"dem_gran_canaria_east.asc", {.32, .96, .06}, {8, 10, 3}, 660},
+                            {"dem_el_hierro.asc", {.25, .95}, {22, 18, 5}, 650}};
   const std::pair<const char*, std::vector<double>> orders[] = {{"layers", {1000, 2000}},
                                                                 {"layers downwards", {2000, 1000}}};
-  for (const auto& [file, figures] : layers)
+  for (const Region& r : regions)
     for (const auto& [order, heights] : orders)
       for (int smoothed : {0, 2}) {
-        Row row{file + format(" %s smoothed %d", order, smoothed), .002, {}, file, {}, figures};
-        if (smoothed > 0 && figures.stdDev > 0) row.figures.min = .42;
-        row.top = 8000, row.layers = {heights, smoothed};
+        Row row{
+            r.file + format(" %s smoothed %d", order, smoothed), .002, {}, r.file, {}, r.figures};
+        if (smoothed > 0 && r.figures.stdDev > 0) row.figures.min = .42;
+        row.top = 8000, row.layers = {heights, smoothed, r.cells, r.lc};
         all.push_back(row);
       }
 }
@@ -163,9 +172,9 @@ void measureDistances(const Mesh& M, const TriangleSurface& D, bool terrain, dou
 /// The layers of a row, one call of insertSurface each.
 QualityStatistics insertLayers(const Row& row, const Terrain& T, const MesherOptions& mesher,
                                Mesh& M) {
-  constexpr double lc = 660, margin = 2600;  // m; cells of 400 m
+  constexpr double margin = 2600;  // m, from the layers' rims to the sides
   InsertOptions options;
-  options.lc = lc, options.optimize.threads = 1, options.onProgress = mesher.onProgress;
+  options.lc = row.layers.lc, options.optimize.threads = 1, options.onProgress = mesher.onProgress;
   QualityStatistics q;
   for (double height : row.layers.heights)
     q = insertSurface(M, samples::layer(samples::smoothed(T, row.layers.smoothed), height, margin),
@@ -202,7 +211,7 @@ Measured meshOf(Row& row, const stress::Arguments& a, Mesh& M) {
   if (row.top > 0) {
     T = row.file.empty() ? samples::island(129) : readTerrain(a.data + "/" + row.file);
     T.top = row.top;
-    if (!row.layers.heights.empty()) T.cells = {T.nx > T.ny ? 10 : 8, T.nx > T.ny ? 8 : 10, 3};
+    T.cells = row.layers.cells;
     options.eps = row.part / .002 * terrainEps(T);
     m.q = meccanoMesher(M, T, options).smoothed;
     row.D = groundOf(T);
