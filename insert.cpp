@@ -6589,14 +6589,31 @@ Vec3 firstInverted(const Mesh& M) {
   return M.x[M.tets[std::min_element(q.begin(), q.end()) - q.begin()][0]];
 }
 
+/// Gives back what the vectors of a refined mesh, which have grown by doubling, do not use: as much
+/// again as the mesh.
+void trim(Mesh& M) {
+  M.x.shrink_to_fit(), M.xi.shrink_to_fit(), M.parameter.shrink_to_fit();
+  M.dimension.shrink_to_fit(), M.entity.shrink_to_fit();
+  M.tets.shrink_to_fit(), M.faceLabel.shrink_to_fit();
+  M.type.shrink_to_fit(), M.level.shrink_to_fit();
+}
+
+/// §3.4's labels and 3.5. Returns the rounds of healing.
+int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {
+  Bisection B(M);
+  labelSurface(B, I.layer.Q, I.layer.A, way.extraction.selected, I.k);
+  ++I.ways;
+  I.stage("extracted", M);
+  const int rounds = surfaceHealing(B, I.k);
+  trim(M);
+  return rounds;
+}
+
 /// §3.4's labels, 3.5, 3.6 and 3.7 on a copy of the refined mesh.
 ///   returns  false: put aside, still tangled
 bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertReport& report) {
-  Bisection B(M);
-  labelSurface(B, I.layer.Q, I.layer.A, way.extraction.selected, I.k);
-  report.way = ++I.ways;
-  I.stage("extracted", M);
-  const int rounds = surfaceHealing(B, I.k);
+  const int rounds = labelAndHeal(I, way, M);
+  report.way = I.ways;
   if (surfaceFaces(M, I.k).empty())
     throw MethodError("insertSurface (§3.5): S_M vanished in healing; lower l_c");
   report.refined = qualityStatistics(M);
@@ -6810,6 +6827,7 @@ void approximate(Insertion& I, const Mesh& M, double lc) {
   I.stage("approximated", I.layer.M);
   checkFacesApart(I);
   volumetricHealing(B, I.layer.A);
+  trim(I.layer.M);
 }
 
 /// The same of its middle, in the mesh as 𝓣 left it.
