@@ -281,6 +281,44 @@ TEST_SUITE("3") {
     CHECK(std::min(after[0], after[1]) == 0);
   }
 
+  TEST_CASE("optimization: surface nodes pressed against each other part again") {
+    Mesh M = unitBox();
+    insertSurface(M, samples::sine(.1, 24), withSize(.12));
+    // the nodes around four places are drawn together, beside them in U
+    for (const Vec2 middle : {Vec2{.3, .3}, Vec2{.3, .7}, Vec2{.7, .3}, Vec2{.7, .7}})
+      for (int n = 0; n < static_cast<int>(M.x.size()); ++n) {
+        const Vec2 away = M.parameter[n] - middle;
+        if (M.dimension[n] != 2 || M.entity[n] != 1 || norm(away) >= .2) continue;
+        M.parameter[n] = middle + Vec2{.2, 0} + 1e-3 * away;
+        M.x[n] = varphi(M.surfaces[0], M.parameter[n]);
+      }
+    OptimizeOptions options;
+    options.globalDescent = false, options.power = 1;
+    const OptimizeReport report = optimizeMesh(M, options);
+    CHECK(report.inverted == 0);
+    CHECK(report.minQ > .5);  // without room of their own they stay in corners: .2
+  }
+
+  TEST_CASE("insertion: a pit narrower than the cubes is followed by smaller faces") {
+    const TriangleSurface S = samples::sheet(60, 60, [](double s, double t) {
+      const double x = .3 * s, y = .3 * t;
+      return Vec3{.5 + x, .5 + y, .5 - .2 * std::exp(-(x * x + y * y) / (.04 * .04))};
+    });
+    std::string told;
+    InsertOptions options = withSize(.12);
+    options.onProgress = [&](const std::string& line) {
+      if (has(line, "refined where")) told = line;
+    };
+    const Mesh before = unitBox();
+    Mesh M = before;
+    const InsertReport report = insertSurface(M, S, options);
+    checkPromises(before, M, S, 1, report, 1e-12 * shapes::diagonal(S));
+    CHECK_FALSE(told.empty());
+    CHECK(report.lc == .12);
+    CHECK(report.hausdorff <= .3 * .12);
+    CHECK(literalHausdorff(M, 1, S) <= .3 * .12);
+  }
+
   TEST_CASE("insertion: S turned over gives a valid mesh as well") {
     TriangleSurface S = samples::sine(.1, 24);
     for (auto& t : S.triangles) std::swap(t[0], t[1]);
