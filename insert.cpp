@@ -6561,6 +6561,7 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
   OptimizeReport& best = report.optimization;
   best = optimizeMesh(M, optimize);
   if (!patient && best.inverted > 0) return;
+  optimize.maxTangledSweeps = I.options.optimize.maxTangledSweeps;  // loosened it may need them
   double factor = narrow;
   for (int round = 0; round < maxRounds; ++round) {
     const bool valid = best.inverted == 0;

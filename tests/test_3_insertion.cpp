@@ -281,6 +281,26 @@ TEST_SUITE("3") {
     CHECK(std::min(after[0], after[1]) == 0);
   }
 
+  TEST_CASE("insertion: a pit narrower than the cubes is followed by smaller faces") {
+    const TriangleSurface S = samples::sheet(60, 60, [](double s, double t) {
+      const double x = .3 * s, y = .3 * t;
+      return Vec3{.5 + x, .5 + y, .5 - .2 * std::exp(-(x * x + y * y) / (.04 * .04))};
+    });
+    std::string told;
+    InsertOptions options = withSize(.12);
+    options.onProgress = [&](const std::string& line) {
+      if (has(line, "refined where")) told = line;
+    };
+    const Mesh before = unitBox();
+    Mesh M = before;
+    const InsertReport report = insertSurface(M, S, options);
+    checkPromises(before, M, S, 1, report, 1e-12 * shapes::diagonal(S));
+    CHECK_FALSE(told.empty());
+    CHECK(report.lc == .12);
+    CHECK(report.hausdorff <= .45 * .12);  // .53 and more before
+    CHECK(literalHausdorff(M, 1, S) <= .45 * .12);
+  }
+
   TEST_CASE("insertion: S turned over gives a valid mesh as well") {
     TriangleSurface S = samples::sine(.1, 24);
     for (auto& t : S.triangles) std::swap(t[0], t[1]);
