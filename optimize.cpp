@@ -976,17 +976,6 @@ std::vector<double> qualitiesOf(const Smoother& S, const std::vector<int>& eleme
   return q;
 }
 
-/// The elements with a vertex that is marked.
-std::vector<int> elementsAt(const Smoother& S, const std::vector<unsigned char>& marked) {
-  std::vector<int> elements;
-  for (std::size_t E = 0; E < S.M.tets.size(); ++E) {
-    const std::array<int, 4>& z = S.M.tets[E];
-    if (marked[z[0]] || marked[z[1]] || marked[z[2]] || marked[z[3]])
-      elements.push_back(static_cast<int>(E));
-  }
-  return elements;
-}
-
 // ---- one visit ---------------------------------------------------------------------------------
 
 struct Edges {
@@ -1628,7 +1617,7 @@ constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is no
 /// [departure] where the worst elements are lifted afterwards, which smooths all others too: so
 /// much of it, and the sweeps end where the root mean square of the displacements is as small. To
 /// sweep on until no node moves took 2 to 10 times the visits for the same qualities in the end.
-constexpr double settledFraction = 4;
+constexpr double settledFraction = 2;
 constexpr int sweepsWithoutProgress = 3;       // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
@@ -1712,33 +1701,38 @@ constexpr double liftWake = .05;   // unrest for a visit, also in the last round
                                    // near the worst counts
 constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
                                    // an element's nodes are not visited again
-/// η_w at least: of η of the worst. 1.07^64 = 76: these outweigh all others; with far less of them
-/// (η/η_w) ^64 would be 1e13 and more, and the others would be lifted farther than what is lowest.
-constexpr double liftRatio = 1.07;
+/// η_w at least: of η of the worst. 1.25^64 = 2e6: these outweigh all others; with less of them the
+/// others would be lifted farther than what is lowest, with more (1.07) sets of faults end lower.
+constexpr double liftRatio = 1.25;
 constexpr double lastLift = 1.005;  // q_w of the last round, of the lowest q: where that is kept
 
-/// The elements that the sweeps have reached (the others, as those at earlier surfaces, were lifted
-/// before), their q, the lowest, the mean, and what bounds the worst of them from above.
+/// q of the elements that the sweeps have reached (the others, as those at earlier surfaces, were
+/// lifted before), the lowest, the mean, and what bounds the worst of them from above.
 struct WorstElements {
-  std::vector<int> element;
-  std::vector<double> q;
+  static constexpr double notReached = 2;  // above every q
+  std::vector<double> q;                   // [tets]
   double lowest = 1, mean = 1, bound = 1;
 };
 
 /// Anew after sweeps: q of the elements at nodes that have moved since, and what follows from them.
 void updateWorst(Smoother& S, WorstElements& worst) {
-  std::vector<int> changed, place;
-  for (std::size_t i = 0; i < worst.element.size(); ++i) {
-    const std::array<int, 4>& z = S.M.tets[worst.element[i]];
-    if (!S.moved[z[0]] && !S.moved[z[1]] && !S.moved[z[2]] && !S.moved[z[3]]) continue;
-    changed.push_back(worst.element[i]);
-    place.push_back(static_cast<int>(i));
-  }
+  const auto isAtAny = [&S](const std::vector<unsigned char>& marked, std::size_t E) {
+    const std::array<int, 4>& z = S.M.tets[E];
+    return marked[z[0]] || marked[z[1]] || marked[z[2]] || marked[z[3]];
+  };
+  worst.q.resize(S.M.tets.size(), worst.notReached);
+  std::vector<int> changed;
+  for (std::size_t E = 0; E < worst.q.size(); ++E)
+    if (worst.q[E] == worst.notReached ? isAtAny(S.reached, E) : isAtAny(S.moved, E))
+      changed.push_back(static_cast<int>(E));
   const std::vector<double> now = qualitiesOf(S, changed);
-  for (std::size_t i = 0; i < place.size(); ++i) worst.q[place[i]] = now[i];
+  for (std::size_t i = 0; i < changed.size(); ++i) worst.q[changed[i]] = now[i];
   S.moved.assign(S.moved.size(), 0);
 
-  std::vector<double> q = worst.q;
+  std::vector<double> q;
+  for (double value : worst.q)
+    if (value != worst.notReached) q.push_back(value);
+  if (q.empty()) return;
   const double count = static_cast<double>(q.size());
   const std::size_t wanted = std::max(worstCount, static_cast<std::size_t>(worstFraction * count));
   const auto bound = q.begin() + static_cast<std::ptrdiff_t>(std::min(q.size(), wanted)) - 1;
@@ -1759,9 +1753,9 @@ void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps) {
   S.penalty = {1, qw, power};
   S.relaxation = S.options.relaxation;
   S.wake = liftWake;
-  for (std::size_t i = 0; i < worst.q.size(); ++i)
-    if (worst.q[i] < reach)
-      for (int n : S.M.tets[worst.element[i]]) wakeNode(S, n);
+  for (std::size_t E = 0; E < worst.q.size(); ++E)
+    if (worst.q[E] < reach)
+      for (int n : S.M.tets[E]) wakeNode(S, n);
   for (int k = 0; k < sweeps && sweepsLeft(S); ++k)
     if (sweepNodes(S) <= liftMaxDisp) return;
 }
@@ -1772,10 +1766,6 @@ void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps) {
 /// others relax and wins the mean back.
 void liftWorst(Smoother& S) {
   WorstElements worst;
-  worst.element = elementsAt(S, S.reached);
-  worst.q.assign(worst.element.size(), 0);
-  if (worst.element.empty()) return;
-  S.moved.assign(S.moved.size(), 1);
   updateWorst(S, worst);
   const double meanAtStart = worst.mean;
   if (worst.lowest > perfect) return;

