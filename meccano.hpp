@@ -756,7 +756,7 @@ struct SquareSurface {
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
 /// [departure] Where neither side of a healed 𝓣 will do: the cubes whose centres are below S, of 𝓣
 /// and of those refined around the lower nodes of the others. The part of its boundary that faces
-/// up runs through the middle of 𝓣, half as far from S as the sides of 𝓣 are. To be healed by
+/// up runs through the middle of 𝓣, about half as far from S as the sides of 𝓣. To be healed by
 /// volumetricHealing().
 Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S);
 

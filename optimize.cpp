@@ -1697,14 +1697,13 @@ constexpr int idleRounds = 2;         // in so many rounds
 constexpr double lowQuality = .45;    // below it the lift has patience:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
 constexpr double liftMaxDisp = 1e-3;  // relative to the shortest edge: a round's sweeps end there
-constexpr double liftWake = .05;   // unrest for a visit, also in the last round: only what happens
-                                   // near the worst counts
+constexpr double liftWake = .05;      // unrest for a visit: only what happens near the worst counts
+constexpr double lastWake = .01;      // and in the last round, that of the mean
 constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
                                    // an element's nodes are not visited again
 /// η_w at least: of η of the worst. 1.25^64 = 2e6: these outweigh all others; with less of them the
 /// others would be lifted farther than what is lowest, with more (1.07) sets of faults end lower.
 constexpr double liftRatio = 1.25;
-constexpr double lastLift = 1.005;  // q_w of the last round, of the lowest q: where that is kept
 
 /// q of the elements that the sweeps have reached (the others, as those at earlier surfaces, were
 /// lifted before), the lowest, the mean, and what bounds the worst of them from above.
@@ -1746,13 +1745,13 @@ void updateWorst(Smoother& S, WorstElements& worst) {
 /// second term has changed since the last round. By how much: with the larger and the smaller q_w
 /// of the two rounds, |Δ| = (larger/q)^power c, c = 1 − (smaller/larger)^power. So |Δ| > liftReach
 /// where q < larger (c/liftReach)^(1/power).
-void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps) {
+void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, double wake) {
   const double power = S.options.power, larger = std::max(qw, S.penalty.scale);
   const double c = 1 - std::pow(std::min(qw, S.penalty.scale) / larger, power);
   const double reach = larger * std::pow(c / liftReach, 1 / power);
   S.penalty = {1, qw, power};
   S.relaxation = S.options.relaxation;
-  S.wake = liftWake;
+  S.wake = wake;
   for (std::size_t E = 0; E < worst.q.size(); ++E)
     if (worst.q[E] < reach)
       for (int n : S.M.tets[E]) wakeNode(S, n);
@@ -1774,14 +1773,14 @@ void liftWorst(Smoother& S) {
     const bool low = worst.lowest < lowQuality;
     if (round >= (low ? patientRounds : liftRounds)) break;
     if (idle >= (low ? patientIdleRounds : idleRounds)) break;
-    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftSweeps);
+    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftSweeps, liftWake);
     updateWorst(S, worst);
     if (worst.mean < meanAtStart - liftMeanLoss) break;
     const bool rises = worst.lowest >= highest + liftMinGain;
     idle = rises ? 0 : idle + 1;
     if (rises) highest = worst.lowest;
   }
-  liftRound(S, worst, lastLift * worst.lowest, lastSweeps);
+  liftRound(S, worst, worst.lowest, lastSweeps, lastWake);
 }
 
 // ---- input -------------------------------------------------------------------------------------

@@ -284,7 +284,7 @@ TEST_SUITE("3.4") {
       CHECK(I.Q.isMiddle);
       ofMiddle += meanDistance(0);
     }
-    CHECK(ofMiddle < .55 * ofSides);
+    CHECK(ofMiddle < .6 * ofSides);
   }
 
   TEST_CASE("half squares: rules (a) to (d) on the masks, both sides") {
