@@ -6549,11 +6549,11 @@ constexpr int impatientSweeps = 12;
 ///   active   the nodes to start from
 void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector<int>& active,
                     InsertReport& report) {
-  constexpr int maxRounds = 4;
+  constexpr int maxRounds = 8;
   constexpr int patientSweeps = 150;  // while tangled, of a loosened mesh: few elements are left
   constexpr std::size_t few = 60;
-  constexpr double poorQuality = .45;         // below it the worst are loosened: those below
-  constexpr double narrow = 1.1, wide = 1.3;  // of the lowest q, then below more of it
+  constexpr double poorQuality = .45;  // below it the worst are loosened: those below
+  constexpr double factors[] = {1.1, 1.3, 1.7, 2.2};  // of the lowest q, in turn while it stays
   OptimizeOptions optimize = I.options.optimize;
   optimize.globalDescent = false;
   optimize.active = active;
@@ -6562,14 +6562,14 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
   best = optimizeMesh(M, optimize);
   if (!patient && best.inverted > 0) return;
   optimize.maxTangledSweeps = I.options.optimize.maxTangledSweeps;  // loosened it may need them
-  double factor = narrow;
+  const double* factor = std::begin(factors);
   for (int round = 0; round < maxRounds; ++round) {
     const bool valid = best.inverted == 0;
     if (valid && (optimize.power == 1 || best.minQ >= poorQuality)) return;
     const std::vector<double> q = qualities(M);
     std::vector<int> bad;
     for (std::size_t E = 0; E < q.size(); ++E)
-      if (q[E] <= factor * best.minQ) bad.push_back(static_cast<int>(E));
+      if (q[E] <= *factor * best.minQ) bad.push_back(static_cast<int>(E));
     if (bad.size() > few) return;
     Mesh trial = M;
     optimize.active = loosen(trial, bad, I.k);
@@ -6578,8 +6578,7 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
     after.sweeps += best.sweeps;
     const bool better =
         valid ? after.inverted == 0 && after.minQ > best.minQ : after.inverted < best.inverted;
-    if (!better && (!valid || factor == wide)) return;
-    if (!better) factor = wide;
+    if (!better && (!valid || ++factor == std::end(factors))) return;
     if (better) M = std::move(trial), best = after;
   }
 }

@@ -1701,9 +1701,9 @@ constexpr double liftWake = .05;      // unrest for a visit: only what happens n
 constexpr double lastWake = .01;      // and in the last round, that of the mean
 constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
                                    // an element's nodes are not visited again
-/// η_w at least: of η of the worst. 1.25^64 = 2e6: these outweigh all others; with less of them the
+/// η_w at least: of η of the worst. 1.3^64 = 2e7: these outweigh all others; with less of them the
 /// others would be lifted farther than what is lowest, with more (1.07) sets of faults end lower.
-constexpr double liftRatio = 1.25;
+constexpr double liftRatio = 1.3;
 
 /// q of the elements that the sweeps have reached (the others, as those at earlier surfaces, were
 /// lifted before), the lowest, the mean, and what bounds the worst of them from above.
