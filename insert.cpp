@@ -6413,6 +6413,7 @@ struct Insertion {
   bool isBlocked = false;   // at this l_c, by an earlier surface
   bool wasBlocked = false;  // at some l_c
   double lowest = 0;        // q of the best way so far
+  double worth = 0;         // and that with its mean
 
   void stage(const char* name, const Mesh& mesh) const {
     if (options.onStage) options.onStage(name, mesh);
@@ -6674,7 +6675,8 @@ constexpr double poorHausdorff = .3, poorWorth = .6;
 
 constexpr double badHausdorff = .45;  // [choice] of l_c: refused
 
-/// [choice] A way is better than another one where its lowest q is higher by more.
+/// [choice] A way is better than another one where its lowest q and its mean together are higher by
+/// more.
 constexpr double betterBy = .01;
 
 /// Refuses S_M where it is far from S, and warns where it is poor.
@@ -6804,8 +6806,9 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
   // beside earlier surfaces the lowest q may be theirs, on every way
   double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
   if (ofThisWay.hausdorff > poorHausdorff * lc) lowest *= poorWorth;
-  if (report.surface == 0 || lowest > I.lowest + betterBy)
-    report = ofThisWay, result = std::move(trial), I.lowest = lowest;
+  const double worth = lowest + ofThisWay.smoothed.mean;
+  if (report.surface == 0 || worth > I.worth + betterBy)
+    report = ofThisWay, result = std::move(trial), I.lowest = lowest, I.worth = worth;
   return true;
 }
 
