@@ -23,7 +23,8 @@ DEMO    = $(BUILD)/demo
 DOCTEST = $(BUILD)/doctest.flags
 ASAN    = $(BUILD)/asan
 SANITIZE  = -fsanitize=address,undefined -fno-sanitize-recover=all
-SANITIZED = $(patsubst %,$(ASAN)/%.o,insert optimize tests/test_files tests/test_pictures tests/test_432_pollutant)
+SANITIZED = $(patsubst %,$(ASAN)/%.o,insert optimize \
+              tests/test_files tests/test_pictures tests/test_432_pollutant)
 
 all: $(PROGRAM)
 

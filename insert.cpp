@@ -6840,6 +6840,7 @@ void approximateMiddle(Insertion& I) {
   volumetricHealing(B, I.layer.A);
 }
 
+/// The squares of 𝓣, or of its middle, and what they know of S.
 void survey(Insertion& I) {
   Layer& layer = I.layer;
   layer.Q = boundarySquares(layer.M, layer.A);

@@ -263,9 +263,9 @@ struct InsertOptions {
   bool followRim = true;     // [§3.6 departure] rim correspondence and anchored equations
   int maxTets = 20000000;    // refuse where more tetrahedra are predicted
   OptimizeOptions optimize;  // §3.7; its active and globalDescent are set by the insertion
-  // Called after each stage with the mesh as it is then: "approximated" (3.2), "healed" (3.3), for
-  // each way that is tried "extracted" (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the
-  // end "smoothed" (3.7).
+  // Called after each stage with the mesh as it is then: "approximated" (3.2), "healed" (3.3, and
+  // again where S_M is taken through the middle of 𝓣), for each way that is tried "extracted"
+  // (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the end "smoothed" (3.7).
   std::function<void(const char* stage, const Mesh&)> onStage = nullptr;
   std::function<void(const std::string& line)> onProgress = nullptr;  // a line per step
   // A callback may throw to stop, but no MethodError or SolverError: M is then unchanged.
@@ -771,7 +771,8 @@ struct Extraction {
   std::string fault;       // why it is no disk, or cannot be used; empty: it is one
   bool isBlocked = false;  // because another surface is in the way
 };
-/// [§3.4] The squares with all nodes on this side (±1) of S, one disk; then the outline's healing:
+/// [§3.4] The squares with all nodes on this side (±1) of S (of a middleApproximation(), side 0:
+/// those whose cube outside is above S), one disk; then the outline's healing:
 /// cases 1 and 2 of §3.5, or [departure] rim regularization, with half squares where asked for.
 Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
                              int side, Outline outline);
@@ -893,7 +894,8 @@ ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& S, bool follo
 // J = Jφ: ideal (computational) element → physical element, both with the vertices in the same
 // order.
 
-/// [§3.7.1, eq. (5)] η = ‖J‖² / (3 |σ|^⅔): 1 for similarities, ∞ (σ = 0) for a degenerate element.
+/// [§3.7.1, eq. (5)] η = ‖J‖² / (3 |σ|^⅔): 1 for similarities, ∞ (σ = 0) for a degenerate
+/// element.
 double eta(const Mat3& J);
 /// [§3.7.1, eq. (6)] J of the affine map from the ideal tetrahedron to the physical one.
 Mat3 jacobian(const std::array<Vec3, 4>& ideal, const std::array<Vec3, 4>& physical);
@@ -902,7 +904,8 @@ double quality(const Mat3& J);
 /// [§3.7.1, eq. (8)] h(σ) = ½(σ + √(σ² + 4δ²)): the determinant made positive.
 ///   sigma   det Jφ, any sign;  delta >= 0, unit of sigma, see chooseDelta()
 ///   returns h > 0, tending to max(σ, 0) as δ → 0
-///   [departure] for σ < 0 computed as 2δ²/(√(σ²+4δ²) − σ): as printed, σ = −1, δ = 1e-9 gives 0
+///   [departure] for σ < 0 computed as 2δ²/(√(σ²+4δ²) − σ): as printed, σ = −1 and δ = 1e-9
+///   give 0
 double h(double sigma, double delta);
 /// η with h(σ) for |σ|; finite for δ > 0, ∞ for δ = 0 and σ <= 0.
 double etaRegularized(const Mat3& J, double delta);

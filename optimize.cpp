@@ -137,7 +137,8 @@ IdealCorner idealCorner(const std::array<Vec3, 4>& z, std::size_t k, double scal
 //   Hess η = 2 e |g|² I − 4/3 e r (v sᵀ + s vᵀ) + η r² [4/9 + ⅔ σ r] s sᵀ.
 // The sum is that of φ(η) = linear η + (scale η)^power, φ = η in eq. (9) as printed. Neither N nor
 // η is divided by, but for φ″:
-//   ∇φ = φ′ ∇η,   Hess φ = φ′ Hess η + φ″ ∇η ∇ηᵀ = α I + β (v sᵀ + s vᵀ) + κ v vᵀ + ρ s sᵀ,
+//   ∇φ = φ′ ∇η,   Hess φ = φ′ Hess η + φ″ ∇η ∇ηᵀ
+//                        = α I + β (v sᵀ + s vᵀ) + κ v vᵀ + ρ s sᵀ,
 //   α = 2 φ′ e |g|²,   β = −4/3 (φ′ + φ″η) e r,   κ = 4 φ″ e²,
 //   ρ = η r² [4/9 (φ′ + φ″η) + ⅔ φ′ σ r].
 //
@@ -1287,7 +1288,8 @@ struct NormalEquations {
 
 /// [§3.7.4 departure] Anderson's acceleration: sweeps hardly move long waves, but all in nearly the
 /// same way. From the last changes ΔR of a sweep's displacements r = G(x) − x and ΔG of its results
-/// G(x) the next start is x = G − Σ γ_j ΔG_j, where γ makes |r − Σ γ_j ΔR_j| least, in local edges.
+/// G(x) the next start is x = G − Σ γ_j ΔG_j, where γ makes |r − Σ γ_j ΔR_j| least, in local
+/// edges.
 /// Mixed are the positions of inner nodes and u of surface nodes (which do not count in γ); s of
 /// curve nodes is left to the sweeps.
 ///   source  Anderson 1965; Walker and Ni 2011

@@ -272,7 +272,8 @@ Field fluxes(const Domain& D, const std::vector<Vec3>& u) {
 }
 
 /// The u = u0 + T∇φ nearest to u0 with ∫ u·∇w = 0 for every w that vanishes, like φ, on the sides
-/// and the top: ∫ T∇φ·∇w = −∫ u0·∇w. The terrain is impermeable by itself, for w does not vanish
+/// and the top: ∫ T∇φ·∇w = −∫ u0·∇w. The terrain is impermeable by itself, for w does not
+/// vanish
 /// there: ∫ u·∇w = ∮ w u·n.
 Wind massConsistentWind(const Domain& D, const std::vector<Vec3>& u0, double ah, double av) {
   constexpr double tolerance = 1e-10;  // the transported mass is kept to this, so below the 1e-8
@@ -360,7 +361,8 @@ struct Balance {
 /// deposition and decay are added in weak form, tested with w alone and taken at c1:
 ///   [M + dt/2 (C + Cᵀ) + dt²/4 S + dt D + dt V_d M_G + dt decay M] c1
 ///                                                = [M − dt/2 (C − Cᵀ) − dt²/4 S] c0
-/// M_ij = ∫ N_i N_j, C_ij = ∫ N_i u·∇N_j, S_ij = ∫ (u·∇N_i)(u·∇N_j), D_ij = ∫ ∇N_i·K∇N_j, M_G the
+/// M_ij = ∫ N_i N_j, C_ij = ∫ N_i u·∇N_j, S_ij = ∫ (u·∇N_i)(u·∇N_j),
+/// D_ij = ∫ ∇N_i·K∇N_j, M_G the
 /// mass of the terrain. Symmetric and positive definite: without the last three it is the Gram
 /// matrix of w + dt/2 u·∇w.
 /// [departure] [36, 37] print more than the paper does: Crank-Nicolson for diffusion too, chemistry
