@@ -301,6 +301,25 @@ TEST_SUITE("3") {
     CHECK(literalHausdorff(M, 1, S) <= .45 * .12);
   }
 
+  TEST_CASE("insertion: two fingers, whose sides end low, through the middle of T") {
+    const TriangleSurface S = samples::sheet(48, 48, [](double s, double t) {
+      const double x = .25 * s, y = .25 * t;
+      const auto finger = [&](double at) {  // .28 high, .14 wide
+        return .28 / (1 + std::pow(std::hypot(x - at, y) / .07, 6));
+      };
+      return Vec3{.5 + x, .5 + y, .35 + std::max(finger(-.12), finger(.12))};
+    });
+    Mesh M = unitBox();
+    InsertOptions options = withSize(.12);
+    std::string lines;
+    options.onProgress = [&](const std::string& line) { lines += line + "\n"; };
+    const InsertReport report = insertSurface(M, S, options);
+    CHECK(lines.find("(middle, ") != std::string::npos);
+    CHECK(report.lc == .12);
+    CHECK(report.smoothed.inverted == 0);
+    CHECK(report.smoothed.min > .6);
+  }
+
   TEST_CASE("insertion: S turned over gives a valid mesh as well") {
     TriangleSurface S = samples::sine(.1, 24);
     for (auto& t : S.triangles) std::swap(t[0], t[1]);
