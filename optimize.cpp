@@ -911,17 +911,36 @@ void orientSheets(std::vector<SheetFace>& faces) {
   }
 }
 
-/// The labelled faces at each sliding node, as triangles of 𝓤.
+/// Whether a face passes over a slit or an overlap of its surface: in 𝓤 the middle of an edge
+/// belongs to a place farther from it than it is long.
+bool isBridge(const Mesh& M, const SheetFace& f) {
+  for (int i = 0; i < 3; ++i) {
+    const int a = f.v[i], b = f.v[(i + 1) % 3];
+    Vec2 u, v;
+    if (!parameterOn(M, a, f.label, u) || !parameterOn(M, b, f.label, v)) return false;
+    const Parametrization& P = surfaceOf(M, f.label);
+    const Location at = locate(P, .5 * (u + v));
+    if (at.triangle < 0) continue;
+    const Vec3 middle = .5 * (M.x[a] + M.x[b]);
+    if (norm(varphi(P, at) - middle) > norm(M.x[a] - M.x[b])) return true;
+  }
+  return false;
+}
+
+/// The labelled faces at each sliding node, as triangles of 𝓤. Without bridges, which are not where
+/// 𝓤 has them: to keep them unfolded would only hold their nodes.
 void buildSheets(Smoother& S) {
   const Mesh& M = S.M;
   if (M.faceLabel.empty() || M.dimension.empty()) return;
   std::vector<SheetFace> faces = sheetFaces(M);
   orientSheets(faces);
   std::vector<std::pair<int, SheetTriangle>> entries;
-  for (const SheetFace& f : faces)
-    for (int i = 0; i < 3 && f.area != 0; ++i)
+  for (const SheetFace& f : faces) {
+    if (f.area == 0 || isBridge(M, f)) continue;
+    for (int i = 0; i < 3; ++i)
       if (S.freedom[f.v[i]] == 1 || S.freedom[f.v[i]] == 2)
         entries.push_back({f.v[i], {f.v[(i + 1) % 3], f.v[(i + 2) % 3], f.label}});
+  }
   S.sheetStart.assign(M.x.size() + 1, 0);
   for (const auto& entry : entries) ++S.sheetStart[entry.first + 1];
   for (std::size_t n = 0; n < M.x.size(); ++n) S.sheetStart[n + 1] += S.sheetStart[n];

@@ -264,8 +264,8 @@ TEST_SUITE("4.2") {
       CHECK(shapes::countInverted(M) == 0);
       CHECK(shapes::isDisk(surfaceFaces(M, 1)));
       CHECK(shapes::maxDistanceToSurface(M, 1, S) <= 1e-12 * shapes::diagonal(S));
-      CHECK(report.hausdorff <= .4 * .12);
-      CHECK(report.smoothed.min > .2);
+      CHECK(report.hausdorff <= .3 * .12);
+      CHECK(report.smoothed.min > .55);  // where bridges hold their nodes .33
       // the edges across the slit can be split: their new nodes stay beside them
       const std::size_t nodes = M.x.size();
       Bisection B(M);
