@@ -6615,8 +6615,6 @@ int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {
 bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertReport& report) {
   const int rounds = labelAndHeal(I, way, M);
   report.way = I.ways;
-  if (surfaceFaces(M, I.k).empty())
-    throw MethodError("insertSurface (§3.5): S_M vanished in healing; lower l_c");
   report.refined = qualityStatistics(M);
   I.stage("surfaceHealed", M);
   I.progress("3.5 surface healing: " + std::to_string(rounds) + " rounds, " +

@@ -694,6 +694,24 @@ TEST_SUITE("3") {
     }
   }
 
+  TEST_CASE("failure: sheets in layers, of which S_M sees the outer ones only, are refused") {
+    const double half = .2, gap = .02;
+    const int layers = 24;
+    const TriangleSurface S = samples::sheet(10, 12 * layers, [=](double s, double t) {
+      const double p = .5 * (t + 1) * layers;  // to and fro along x
+      const int layer = std::min(static_cast<int>(p), layers - 1);
+      const double along = p - layer, x = half * (2 * along - 1);
+      const double z = gap * (layer + along * along * along - .5 * layers);
+      return Vec3{.5 + (layer % 2 ? -x : x), .5 + half * s, .5 + z};
+    });
+    Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {3, 3, 3});
+    const std::string text = refusal(M, S, withSize(.12), false);
+    CAPTURE(text);
+    CHECK(has(text, "S_M leaves out the part of S near ("));
+    CHECK(has(text, "sheets of S that face each other is 0.00"));
+    CHECK(has(text, "lower l_c to 0.00"));
+  }
+
   TEST_CASE("failure: an exception of the host's own callback leaves the mesh as it was") {
     for (const char* name :
          {"approximated", "healed", "extracted", "surfaceHealed", "projected", "smoothed"}) {

@@ -158,6 +158,27 @@ TEST_SUITE("4.2") {
     CHECK(has(text, "lower l_c to 5e-06"));
   }
 
+  TEST_CASE("sets: coarse faces of an earlier surface that S crosses lower l_c, and are told") {
+    const auto cap = [](double half, double below) {  // of a sphere of radius .45
+      return samples::sheet(24, 24, [=](double s, double t) {
+        const double x = half * s, y = half * t;
+        return Vec3{.5 + x, .5 + y, .05 - below + std::sqrt(.45 * .45 - x * x - y * y)};
+      });
+    };
+    Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2});
+    insertSurface(M, cap(.28, 0), withSize(.2));
+    InsertOptions options = withSize(.15);
+    std::string lines;
+    options.onProgress = [&](const std::string& line) { lines += line + "\n"; };
+    const InsertReport report = insertSurface(M, cap(.1, .001), options);
+    CAPTURE(lines);
+    CHECK(has(lines, "l_c = 0.15 left: S crosses the faces of an earlier surface at triangle "));
+    CHECK(report.lc == .075);
+    REQUIRE_FALSE(report.warnings.empty());
+    CHECK(has(report.warnings[0], "lowered from 0.15"));
+    CHECK(shapes::countInverted(M) == 0);
+  }
+
   TEST_CASE("sets: surfaces that cross or touch are refused with both names and the place") {
     const TriangleSurface a = sheetAt({.5, .5, .5}, .2, 0, "flat");
     TriangleSurface b = sheetAt({.5, .5, .5}, .15, 0, "upright");
