@@ -35,7 +35,7 @@ struct Floor {
 struct Case {
   std::string name;
   TriangleSurface S;
-  double lc;
+  double lc;  // 0: chosen
   bool paper;
   Floor floor;
 };
@@ -45,7 +45,7 @@ struct Result {
   std::string message;  // why refused or not valid
   QualityStatistics q;
   int projected = 0;  // inverted after the projection
-  double hausdorff = 0, seconds = 0;
+  double lc = 0, hausdorff = 0, seconds = 0;
 };
 
 /// DESIGN 1's promises: empty where the mesh keeps them.
@@ -85,7 +85,7 @@ Result runCase(const Case& c, const Settings& settings) {
     r.returned = true;
     r.q = report.smoothed;
     r.projected = report.projected.inverted;
-    r.hausdorff = report.hausdorff;
+    r.lc = report.lc, r.hausdorff = report.hausdorff;
     r.message = brokenPromise(M, report.surface, c.S);
     r.valid = r.message.empty();
   } catch (const Error& error) {
@@ -110,9 +110,9 @@ void printLine(const Case& c, const Result& r, bool figures) {
   char text[256];
   std::snprintf(
       text, sizeof text,
-      "%-22s lc %-5g %-7s %7d tets  projected %5d  min %.3f mean %.3f std %.3f  H/lc %.2f %6.1f s",
-      c.name.c_str(), c.lc, c.paper ? "paper" : "default", r.q.tetrahedra, r.projected, r.q.min,
-      r.q.mean, r.q.stdDev, r.hausdorff / c.lc, r.seconds);
+      "%-22s lc %-6.3g %-7s %7d tets  projected %5d  min %.3f mean %.3f std %.3f  H/lc %.2f %6.1f s",
+      c.name.c_str(), r.returned ? r.lc : c.lc, c.paper ? "paper" : "default", r.q.tetrahedra,
+      r.projected, r.q.min, r.q.mean, r.q.stdDev, r.hausdorff / r.lc, r.seconds);
   std::string line = text;
   if (figures) {
     if (c.floor.min < 0)
@@ -196,7 +196,28 @@ std::vector<Case> namedCases(bool paper) {
   add("cap 165", cap(165), .06, valid);
   add("disc 0", disc(), .06, valid);
   add("disc 20", disc(20), .06, valid);
-  add("ridge knife", ridge(Ridge::knife), .06, valid);  // at half the l_c
+  add("ridge knife", ridge(Ridge::knife), .06, valid);
+  const double chosen = 0;
+  add("strip 10:1",
+      sheet(80, 8,
+            [](double s, double t) {
+              return centre + turned({.35 * s, .035 * t, .05 * std::sin(pi * s)}, 2, 30);
+            }),
+      chosen, curved);
+  add("turn by 170",
+      sheet(40, 40,
+            [](double s, double t) {
+              const double angle = s * 85 * pi / 180;
+              return centre + Vec3{.2 * std::sin(angle), .3 * t, .2 * std::cos(angle) - .1};
+            }),
+      chosen, curved);
+  add("sine, 24 triangles",
+      sheet(4, 3,
+            [](double s, double t) {
+              return centre + Vec3{.35 * s, .35 * t, .1 * std::sin(pi * s)};
+            }),
+      chosen, curved);
+  add("sine, 49928 triangles", sine(.1, 158), chosen, curved);
   return cases;
 }
 
