@@ -2388,7 +2388,7 @@ void Bisection::bisectRing(const std::vector<int>& around) {
     M.tets.push_back(halves[2 * i + 1].z);
     neighbour.push_back(halves[2 * i + 1].neighbour);
     M.faceLabel.push_back(halves[2 * i + 1].label);
-    splits.push_back({t, t1});
+    splits.push_back({t, t1, m});
   }
   for (std::size_t i = 0; i < around.size(); ++i) {
     const int t = around[i];
@@ -3929,8 +3929,8 @@ SurfaceDistance::SurfaceDistance(const TriangleSurface& cleaned)
   for (Vec3& n : vertexNormal) n = unitVector(n);
 }
 
-SurfaceQuery SurfaceDistance::query(Vec3 x) const {
-  const ClosestPoint p = tree.closest(x);
+SurfaceQuery SurfaceDistance::query(Vec3 x, double within) const {
+  const ClosestPoint p = tree.closest(x, within);
   SurfaceQuery q{p, faceNormal[p.triangle], 0, false, 0};
   if (p.feature == Feature::edge) {
     q.normal = edgeNormal[p.triangle][p.which];
@@ -4047,7 +4047,11 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
   const auto isNearLast = [&](Vec3 p) { return isNear(B, last, p, largest.distance); };
   for (const std::array<Vec3, 3>& c : A.corners) {
     // the distance from one triangle is a convex function: on another one largest at a corner
-    if (isNearLast(c[0]) && isNearLast(c[1]) && isNearLast(c[2])) continue;
+    const auto areNear = [&] { return isNearLast(c[0]) && isNearLast(c[1]) && isNearLast(c[2]); };
+    if (areNear()) continue;
+    const int atMiddle = triangleWithin(B, (1. / 3) * (c[0] + c[1] + c[2]), largest.distance);
+    if (atMiddle >= 0) last = atMiddle;
+    if (atMiddle >= 0 && areNear()) continue;
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
     for (int i = 0; i <= m; ++i)
@@ -4202,23 +4206,51 @@ double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int sampl
 
 // ==== Tools for 3.2: triangle–tetrahedron intersection ===========================================
 
-bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle) {
+namespace {
+
+/// The faces of a tetrahedron: height(i, x) is 0 on the plane opposite to vertex i, 1 at i.
+class FacePlanes {
+ public:
+  explicit FacePlanes(const std::array<Vec3, 4>& tet) {
+    constexpr int faces[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+    for (int i = 0; i < 4; ++i) {
+      on_[i] = tet[faces[i][0]];
+      const Vec3 n = cross(tet[faces[i][1]] - on_[i], tet[faces[i][2]] - on_[i]);
+      inward_[i] = (1 / dot(n, tet[i] - on_[i])) * n;
+    }
+  }
+  double height(int i, Vec3 x) const { return dot(inward_[i], x - on_[i]); }
+
+ private:
+  Vec3 on_[4], inward_[4];
+};
+
+/// Whether a triangle meets the tetrahedron: what is left of it when clipped by the four planes.
+bool meets(const FacePlanes& planes, const std::array<Vec3, 3>& triangle) {
   constexpr double tolerance =
       1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
-  constexpr int faces[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
+  // mostly the corners tell: one inside all planes, or all three beyond one
+  bool inside[3] = {true, true, true};
+  for (int i = 0; i < 4; ++i) {
+    bool beyond = true;
+    for (int j = 0; j < 3; ++j) {
+      const bool in = planes.height(i, triangle[j]) + tolerance >= 0;
+      inside[j] = inside[j] && in;
+      beyond = beyond && !in;
+    }
+    if (beyond) return false;
+  }
+  if (inside[0] || inside[1] || inside[2]) return true;
+
   Vec3 polygon[16],
       clipped[16];  // three corners, one more for each plane; rounding on needles: twice that
   int corners = 3;
   for (int i = 0; i < 3; ++i) polygon[i] = triangle[i];
   for (int i = 0; i < 4; ++i) {
-    const Vec3 a = tet[faces[i][0]], b = tet[faces[i][1]], c = tet[faces[i][2]];
-    Vec3 inward = cross(b - a, c - a);
-    const double height = dot(inward, tet[i] - a);
-    inward = (1 / height) * inward;  // 0 on the face, 1 at the opposite vertex
     int kept = 0;
     for (int j = 0; j < corners; ++j) {
       const Vec3 p = polygon[j], q = polygon[(j + 1) % corners];
-      const double dp = dot(inward, p - a) + tolerance, dq = dot(inward, q - a) + tolerance;
+      const double dp = planes.height(i, p) + tolerance, dq = planes.height(i, q) + tolerance;
       if (dp >= 0) clipped[kept++] = p;
       if ((dp > 0 && dq < 0) || (dp < 0 && dq > 0)) clipped[kept++] = p + dp / (dp - dq) * (q - p);
     }
@@ -4227,6 +4259,12 @@ bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& trian
     std::copy(clipped, clipped + kept, polygon);
   }
   return true;
+}
+
+}  // namespace
+
+bool intersects(const std::array<Vec3, 4>& tet, const std::array<Vec3, 3>& triangle) {
+  return meets(FacePlanes(tet), triangle);
 }
 
 // ==== 3.2 Volumetric approximation ===============================================================
@@ -4255,11 +4293,10 @@ bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
     hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
   }
   const Vec3 margin = 1e-9 * (hi - lo);
+  const FacePlanes planes(tet);
   bool hit = false;
-  S.tree.visit(lo - margin, hi + margin, [&](int t) {
-    const std::array<int, 3>& v = S.S.triangles[t];
-    return hit = intersects(tet, {S.S.points[v[0]], S.S.points[v[1]], S.S.points[v[2]]});
-  });
+  S.tree.visit(lo - margin, hi + margin,
+               [&](int t) { return hit = meets(planes, cornersOf(S.S, t)); });
   return hit;
 }
 
@@ -4288,7 +4325,12 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wa
     for (const auto& [E, level] : refine)
       if (B.M.level[E] == level) B.bisect(E);
     cut.resize(B.M.tets.size(), Cut::unknown);
-    for (const auto& [parent, child] : B.splits) cut[parent] = cut[child] = Cut::unknown;
+    // what is not cut has no parts that are, but where a midpoint was moved onto a surface
+    for (const Bisection::Split& split : B.splits) {
+      const bool isPart = B.M.dimension[split.midpoint] == 3;
+      const Cut part = isPart && cut[split.parent] == Cut::no ? Cut::no : Cut::unknown;
+      cut[split.parent] = cut[split.child] = part;
+    }
   }
 }
 
@@ -4804,18 +4846,26 @@ bool crossesAny(const TriangleTree& tree, const std::vector<Vec3>& x,
 }
 
 Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
-  constexpr double reach = 4;  // of h: no square of ∂T is farther from S
+  constexpr double reach = 4;          // of h: no square of ∂T is farther from S
+  constexpr double withSlack = 1.001;  // above the rounding of a bound
   const std::vector<std::array<int, 3>> earlier = facesAround(M, S, reach * Q.h);
   const TriangleTree tree(M.x, earlier);
   Survey survey;
   survey.side.assign(M.x.size(), 0);
   survey.sharp.assign(M.x.size(), 0);
-  for (int n : Q.nodes) survey.side[n] = S.query(M.x[n]).side >= 0 ? 1 : -1;
   const double perH = 1 / Q.h;
   for (const Square& s : Q.squares) {
-    bool isFree = true;
-    for (int n : s.node) isFree &= M.dimension[n] == 3;
     const SurfaceQuery middle = S.query(s.centre);
+    const double toRim = S.rimDistance(middle.point);
+    // no point is farther from S than the centre and the way to it
+    const auto queryNear = [&](Vec3 x) {
+      return S.query(x, withSlack * (middle.distance + norm(x - s.centre)));
+    };
+    bool isFree = true;
+    for (int n : s.node) {
+      isFree &= M.dimension[n] == 3;
+      if (survey.side[n] == 0) survey.side[n] = queryNear(M.x[n]).side >= 0 ? 1 : -1;
+    }
     isFree = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
     survey.free.push_back(isFree);
     survey.excess.push_back(perH * middle.excess);
@@ -4823,9 +4873,10 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
     std::array<double, 4> beyond{}, above{};
     for (int e = 0; e < 4; ++e) {
       const SurfaceQuery near =
-          S.query((1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
+          queryNear((1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
       beyond[e] = perH * near.excess;
-      if (!near.onRim) above[e] = perH * S.rimDistance(near.point);
+      const double rimWithin = withSlack * (toRim + norm(near.point - middle.point));
+      if (!near.onRim) above[e] = perH * S.rimTree.closest(near.point, rimWithin).distance;
     }
     survey.beyond.push_back(beyond);
     survey.above.push_back(above);

@@ -387,7 +387,10 @@ struct Bisection {
   Mesh& M;
   std::vector<std::array<int, 4>> neighbour;  // [tets], as faceNeighbours
   std::vector<int> tetOf;                     // [nodes], a tetrahedron at the node
-  std::vector<std::pair<int, int>> splits;    // log: index of the parent (now child 0), of child 1
+  struct Split {
+    int parent, child, midpoint;  // the parent is now child 0; child 1; the new node
+  };
+  std::vector<Split> splits;  // log
 
   explicit Bisection(Mesh& M);
   /// Kossaczký's method: first neighbours with another refinement edge, then the whole ring at
@@ -641,7 +644,8 @@ struct SurfaceDistance {
   std::vector<char> isRimPoint;                 // [points]
 
   explicit SurfaceDistance(const TriangleSurface& cleaned);
-  SurfaceQuery query(Vec3 x) const;
+  /// `within`: S is known to be nearer, which saves search.
+  SurfaceQuery query(Vec3 x, double within = 1e300) const;
   double rimDistance(Vec3 x) const;  // distance to the rim polyline
 };
 
