@@ -3746,10 +3746,13 @@ int genusOf(const TriangleSurface& D) {
 
 namespace {
 
-constexpr double beyondAll = 1e300;  // beyond every coordinate; its square is not needed
+constexpr double beyondAll = 1e300;  // beyond every coordinate; its square is infinite
 constexpr int trianglesPerLeaf = 4;
-/// A box is skipped where it is farther by more than this fraction: rounding of distances.
-constexpr double boxMargin = 1e-12;
+/// Whether a box is farther than the bound, by more than rounding; a negative bound: always.
+bool isFarther(double distance2, double bound) {
+  constexpr double rounding = 2e-12;  // relative, of squared distances
+  return distance2 > bound * std::abs(bound) * (1 + rounding);
+}
 
 /// Takes the nearest point of the edge from corner i to the next over into best if it is nearer.
 void keepNearerOnEdge(Vec3 x, const std::array<Vec3, 3>& corner, int i, ClosestPoint& best) {
@@ -3766,12 +3769,12 @@ void keepNearerOnEdge(Vec3 x, const std::array<Vec3, 3>& corner, int i, ClosestP
   best.w[j] = t;
 }
 
-/// Distance of two boxes, 0 where they meet; a point is a box too.
-double boxDistance(const TriangleTree::Box& a, const TriangleTree::Box& b) {
+/// Distance of two boxes, squared, 0 where they meet; a point is a box too.
+double boxDistance2(const TriangleTree::Box& a, const TriangleTree::Box& b) {
   const Vec3 after = a.lo - b.hi, before = b.lo - a.hi;
-  return norm(Vec3{std::max(std::max(after.x, before.x), 0.),
-                   std::max(std::max(after.y, before.y), 0.),
-                   std::max(std::max(after.z, before.z), 0.)});
+  return norm2(Vec3{std::max(std::max(after.x, before.x), 0.),
+                    std::max(std::max(after.y, before.y), 0.),
+                    std::max(std::max(after.z, before.z), 0.)});
 }
 
 void growBox(TriangleTree::Box& box, Vec3 p) {
@@ -3805,17 +3808,17 @@ void buildTreeNode(TriangleTree& tree, const std::vector<std::array<Vec3, 3>>& c
 }
 
 /// Calls visit(i) for the triangles (in tree order) of leaves not farther from `box` than `bound`,
-/// which visit() lowers; the nearer child first. From node n at `distance` on.
+/// which visit() lowers; the nearer child first. From node n on.
 template <class Visit>
-void visitNearest(const TriangleTree& tree, int n, double distance, const TriangleTree::Box& box,
+void visitNearest(const TriangleTree& tree, int n, double distance2, const TriangleTree::Box& box,
                   const double& bound, const Visit& visit) {
-  if (distance > bound * (1 + boxMargin)) return;
+  if (isFarther(distance2, bound)) return;
   const TriangleTree::Node& node = tree.nodes[n];
   for (int i = node.first; i < node.first + node.count; ++i) visit(i);
   if (node.count > 0) return;
   int near = n + 1, far = node.right;
-  double toNear = boxDistance(tree.nodes[near].box, box);
-  double toFar = boxDistance(tree.nodes[far].box, box);
+  double toNear = boxDistance2(tree.nodes[near].box, box);
+  double toFar = boxDistance2(tree.nodes[far].box, box);
   if (toFar < toNear) {
     std::swap(near, far);
     std::swap(toNear, toFar);
@@ -3870,8 +3873,8 @@ TriangleTree::TriangleTree(const std::vector<Vec3>& points,
 ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
   if (nodes.empty()) return best;
-  visitNearest(*this, 0, boxDistance(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
-    if (boxDistance(boxOf(corners[i]), {x, x}) > best.distance * (1 + boxMargin)) return;
+  visitNearest(*this, 0, boxDistance2(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
+    if (isFarther(boxDistance2(boxOf(corners[i]), {x, x}), best.distance)) return;
     ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
     p.triangle = triangle[i];
     const bool lower = p.distance == best.distance && p.triangle < best.triangle;
@@ -4032,7 +4035,7 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
   if (tree.nodes.empty()) return -1;
   double bound = distance;  // −1 ends the search
   int found = -1;
-  visitNearest(tree, 0, boxDistance(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
+  visitNearest(tree, 0, boxDistance2(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
     if (found < 0 && isNear(tree, i, x, distance)) found = i, bound = -1;
   });
   return found;
@@ -4043,24 +4046,33 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
 Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
                       Width largest = {0, {}}) {
   constexpr double mostSteps = 1000;
-  int last = 0;  // the triangle of B that was near: neighbours in A are so to the same
-  const auto isNearLast = [&](Vec3 p) { return isNear(B, last, p, largest.distance); };
+  // the triangles of B that were near last: neighbours in A are so to the same
+  std::array<int, 4> recent{};
+  const auto isNearRecent = [&](Vec3 p) {
+    for (int& t : recent)
+      if (isNear(B, t, p, largest.distance)) {
+        std::swap(t, recent[0]);
+        return true;
+      }
+    return false;
+  };
+  const auto findNear = [&](Vec3 p) {
+    if (isNearRecent(p)) return true;
+    const int near = triangleWithin(B, p, largest.distance);
+    if (near >= 0) std::rotate(recent.begin(), recent.end() - 1, recent.end()), recent[0] = near;
+    return near >= 0;
+  };
   for (const std::array<Vec3, 3>& c : A.corners) {
     // the distance from one triangle is a convex function: on another one largest at a corner
-    const auto areNear = [&] { return isNearLast(c[0]) && isNearLast(c[1]) && isNearLast(c[2]); };
-    if (areNear()) continue;
-    const int atMiddle = triangleWithin(B, (1. / 3) * (c[0] + c[1] + c[2]), largest.distance);
-    if (atMiddle >= 0) last = atMiddle;
-    if (atMiddle >= 0 && areNear()) continue;
+    findNear((1. / 3) * (c[0] + c[1] + c[2]));
+    const auto isNearOne = [&](Vec3 p) { return isNear(B, recent[0], p, largest.distance); };
+    if (isNearOne(c[0]) && isNearOne(c[1]) && isNearOne(c[2])) continue;
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
     for (int i = 0; i <= m; ++i)
       for (int j = 0; i + j <= m; ++j) {
         const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
-        if (isNearLast(p)) continue;
-        const int near = triangleWithin(B, p, largest.distance);
-        if (near < 0) largest = {B.closest(p).distance, p};
-        if (near >= 0) last = near;
+        if (!findNear(p)) largest = {B.closest(p).distance, p};
       }
   }
   return largest;
@@ -4075,7 +4087,7 @@ Gap gapWithin(const TriangleTree& tree, const std::vector<Vec3>& points,
     const std::array<int, 3>& v = triangles[o];
     const std::array<Vec3, 3> other{points[v[0]], points[v[1]], points[v[2]]};
     const TriangleTree::Box box = boxOf(other);
-    const double start = boxDistance(tree.nodes[0].box, box);
+    const double start = boxDistance2(tree.nodes[0].box, box);
     visitNearest(tree, 0, start, box, gap.distance, [&](int i) {
       Vec3 on;
       const double d = trianglesDistance(tree.corners[i], other, on);
@@ -4848,6 +4860,7 @@ bool crossesAny(const TriangleTree& tree, const std::vector<Vec3>& x,
 Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
   constexpr double reach = 4;          // of h: no square of ∂T is farther from S
   constexpr double withSlack = 1.001;  // above the rounding of a bound
+  constexpr double deep = 8;           // of h, from the rim of S: no square there is ever removed
   const std::vector<std::array<int, 3>> earlier = facesAround(M, S, reach * Q.h);
   const TriangleTree tree(M.x, earlier);
   Survey survey;
@@ -4856,7 +4869,6 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
   const double perH = 1 / Q.h;
   for (const Square& s : Q.squares) {
     const SurfaceQuery middle = S.query(s.centre);
-    const double toRim = S.rimDistance(middle.point);
     // no point is farther from S than the centre and the way to it
     const auto queryNear = [&](Vec3 x) {
       return S.query(x, withSlack * (middle.distance + norm(x - s.centre)));
@@ -4870,13 +4882,13 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
     survey.free.push_back(isFree);
     survey.excess.push_back(perH * middle.excess);
     if (Q.isMiddle) survey.facesUp.push_back(S.query(s.beyond).side >= 0);
-    std::array<double, 4> beyond{}, above{};
-    for (int e = 0; e < 4; ++e) {
+    std::array<double, 4> beyond{}, above{deep, deep, deep, deep};
+    const bool isDeep = triangleWithin(S.rimTree, middle.point, deep * Q.h) < 0;
+    for (int e = 0; e < 4 && !isDeep; ++e) {
       const SurfaceQuery near =
           queryNear((1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
       beyond[e] = perH * near.excess;
-      const double rimWithin = withSlack * (toRim + norm(near.point - middle.point));
-      if (!near.onRim) above[e] = perH * S.rimTree.closest(near.point, rimWithin).distance;
+      above[e] = near.onRim ? 0 : perH * S.rimDistance(near.point);
     }
     survey.beyond.push_back(beyond);
     survey.above.push_back(above);
