@@ -2050,32 +2050,46 @@ void placeInterior(Mesh& M) {
 
 // ==== 2. Kossaczký bisection [17] ================================================================
 
+namespace {
+
+/// The corners 0 to 3 of an element by the numbers of their nodes.
+std::array<int, 4> sortedCorners(const std::array<int, 4>& z) {
+  std::array<int, 4> o{0, 1, 2, 3};
+  for (const auto& [a, b] : {std::pair{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}})  // sorts any four
+    if (z[o[b]] < z[o[a]]) std::swap(o[a], o[b]);
+  return o;
+}
+
+}  // namespace
+
 std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
   const int nodes = static_cast<int>(M.x.size()), count = static_cast<int>(M.tets.size());
   std::vector<std::array<int, 4>> neighbour(count, {-1, -1, -1, -1});
-  // Faces grouped by their smallest node; within a group equal faces are found by comparing.
-  auto face = [&](int E, int i) {
-    const std::array<int, 4>& z = M.tets[E];
-    std::array<int, 3> v{z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
-    std::sort(v.begin(), v.end());
-    return v;
-  };
+  // Faces grouped by their smallest node; within a group equal faces are found by comparing the
+  // other two. Of the sorted nodes of an element three faces begin with the first, one with the
+  // second.
   std::vector<int> start(nodes + 1, 0);
-  for (int E = 0; E < count; ++E)
-    for (int i = 0; i < 4; ++i) ++start[face(E, i)[0] + 1];
+  for (const std::array<int, 4>& z : M.tets) {
+    const std::array<int, 4> o = sortedCorners(z);
+    start[z[o[0]] + 1] += 3;
+    ++start[z[o[1]] + 1];
+  }
   std::partial_sum(start.begin(), start.end(), start.begin());
   struct Waiting {
     int v1, v2, E, i;
   };
   std::vector<Waiting> group(start.back());
   std::vector<int> filled(start.begin(), start.end() - 1);
-  for (int E = 0; E < count; ++E)
-    for (int i = 0; i < 4; ++i) {
-      const std::array<int, 3> v = face(E, i);
-      int g = start[v[0]];
-      while (g < filled[v[0]] && (group[g].v1 != v[1] || group[g].v2 != v[2])) ++g;
-      if (g == filled[v[0]]) {
-        group[filled[v[0]]++] = {v[1], v[2], E, i};
+  for (int E = 0; E < count; ++E) {
+    const std::array<int, 4>& z = M.tets[E];
+    const std::array<int, 4> o = sortedCorners(z);
+    for (int k = 0; k < 4; ++k) {
+      const int v0 = z[o[k < 1 ? 1 : 0]], v1 = z[o[k < 2 ? 2 : 1]], v2 = z[o[k < 3 ? 3 : 2]];
+      const int i = o[k];
+      int g = start[v0];
+      while (g < filled[v0] && (group[g].v1 != v1 || group[g].v2 != v2)) ++g;
+      if (g == filled[v0]) {
+        group[filled[v0]++] = {v1, v2, E, i};
         continue;
       }
       if (neighbour[group[g].E][group[g].i] >= 0)
@@ -2084,11 +2098,14 @@ std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
       neighbour[group[g].E][group[g].i] = E;
       neighbour[E][i] = group[g].E;
     }
+  }
   return neighbour;
 }
 
-Bisection::Bisection(Mesh& mesh)
-    : M(mesh), neighbour(faceNeighbours(mesh)), tetOf(mesh.x.size(), -1) {
+Bisection::Bisection(Mesh& mesh) : Bisection(mesh, faceNeighbours(mesh)) {}
+
+Bisection::Bisection(Mesh& mesh, std::vector<std::array<int, 4>> known)
+    : M(mesh), neighbour(std::move(known)), tetOf(mesh.x.size(), -1) {
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int n : M.tets[E]) tetOf[n] = static_cast<int>(E);
 }
@@ -6456,7 +6473,9 @@ struct Way {
 
 /// The mesh refined by §3.2 and §3.3, 𝓣 or its middle, and its squares.
 struct Layer {
-  Mesh M = {};
+  Mesh M = {};                                     // empty where a way has taken it
+  std::vector<std::array<int, 4>> neighbour = {};  // of M, as faceNeighbours
+  double lc = 0;
   Approximation A = {};
   SquareSurface Q = {};
   Survey survey = {};
@@ -6464,6 +6483,7 @@ struct Layer {
 
 /// The state of an insertion, from the copy of the caller's mesh on.
 struct Insertion {
+  const Mesh& original;  // the caller's
   const SurfaceDistance& S;
   const InsertOptions& options;
   int k;         // number of the new surface
@@ -6522,8 +6542,36 @@ std::string leftOut(const Insertion& I, const Selection& selected) {
 /// .004 in the lowest q): one is enough.
 constexpr double mirrored = .01;
 
+/// Gives back what the vectors of a refined mesh, which have grown by doubling, do not use: as much
+/// again as the mesh.
+void trim(Mesh& M) {
+  M.x.shrink_to_fit(), M.xi.shrink_to_fit(), M.parameter.shrink_to_fit();
+  M.dimension.shrink_to_fit(), M.entity.shrink_to_fit();
+  M.tets.shrink_to_fit(), M.faceLabel.shrink_to_fit();
+  M.type.shrink_to_fit(), M.level.shrink_to_fit();
+}
+
+/// §3.2 and §3.3 again, for the layer whose mesh was taken.
+void restoreLayer(Insertion& I) {
+  Layer& layer = I.layer;
+  if (!layer.M.tets.empty()) return;
+  layer.M = I.original;
+  Bisection B(layer.M);
+  Approximation A = volumetricApproximation(B, I.S, layer.lc);
+  volumetricHealing(B, A);
+  layer.neighbour = std::move(B.neighbour);
+  if (layer.A.isMiddle) {
+    Bisection again(layer.M, std::move(layer.neighbour));
+    A = middleApproximation(again, A, I.S);
+    volumetricHealing(again, A);
+    layer.neighbour = std::move(again.neighbour);
+  }
+  trim(layer.M);
+}
+
 /// §3.4 on both sides: the ways to go on with this outline, best first.
 std::vector<Way> extractWays(Insertion& I, Outline outline) {
+  restoreLayer(I);
   std::vector<Way> ways;
   for (int side : I.layer.Q.isMiddle ? std::vector<int>{0} : std::vector<int>{1, -1}) {
     Way way{side, outline,
@@ -6566,12 +6614,11 @@ std::vector<int> nodesNear(const Mesh& M, int k) {
 double lowestNear(const Mesh& M, int k) {
   std::vector<char> near(M.x.size(), 0);
   for (int n : nodesNear(M, k)) near[n] = 1;
-  const std::vector<double> q = qualities(M);
   double lowest = 1;
-  for (std::size_t E = 0; E < q.size(); ++E) {
-    const std::array<int, 4>& z = M.tets[E];
-    if (near[z[0]] || near[z[1]] || near[z[2]] || near[z[3]]) lowest = std::min(lowest, q[E]);
-  }
+  for (const std::array<int, 4>& z : M.tets)
+    if (near[z[0]] || near[z[1]] || near[z[2]] || near[z[3]])
+      lowest = std::min(lowest, quality(jacobian({M.xi[z[0]], M.xi[z[1]], M.xi[z[2]], M.xi[z[3]]},
+                                                 {M.x[z[0]], M.x[z[1]], M.x[z[2]], M.x[z[3]]})));
   return lowest;
 }
 
@@ -6653,19 +6700,19 @@ Vec3 firstInverted(const Mesh& M) {
   return M.x[M.tets[std::min_element(q.begin(), q.end()) - q.begin()][0]];
 }
 
-/// Gives back what the vectors of a refined mesh, which have grown by doubling, do not use: as much
-/// again as the mesh.
-void trim(Mesh& M) {
-  M.x.shrink_to_fit(), M.xi.shrink_to_fit(), M.parameter.shrink_to_fit();
-  M.dimension.shrink_to_fit(), M.entity.shrink_to_fit();
-  M.tets.shrink_to_fit(), M.faceLabel.shrink_to_fit();
-  M.type.shrink_to_fit(), M.level.shrink_to_fit();
-}
+/// [choice] From so many elements on a way takes the refined mesh for itself instead of a copy, a
+/// fifth of all memory; most meshes of this size need but one way.
+constexpr std::size_t tooLargeToCopy = 500000;
 
-/// §3.4's labels and 3.5. Returns the rounds of healing.
+/// §3.4's labels and 3.5 on the refined mesh. Returns the rounds of healing.
 int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {
-  Bisection B(M);
-  labelSurface(B, I.layer.Q, I.layer.A, way.extraction.selected, I.k);
+  restoreLayer(I);
+  Layer& layer = I.layer;
+  const bool take = layer.M.tets.size() >= tooLargeToCopy;
+  M = take ? std::move(layer.M) : layer.M;
+  Bisection B(M, take ? std::move(layer.neighbour) : layer.neighbour);
+  if (take) layer.M = {}, layer.neighbour = {};
+  labelSurface(B, layer.Q, layer.A, way.extraction.selected, I.k);
   ++I.ways;
   I.stage("extracted", M);
   const int rounds = surfaceHealing(B, I.k);
@@ -6673,7 +6720,7 @@ int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {
   return rounds;
 }
 
-/// §3.4's labels, 3.5, 3.6 and 3.7 on a copy of the refined mesh.
+/// §3.4's labels, 3.5, 3.6 and 3.7 on the refined mesh, which becomes M.
 ///   returns  false: put aside, still tangled
 bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertReport& report) {
   const int rounds = labelAndHeal(I, way, M);
@@ -6689,7 +6736,7 @@ bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertRepo
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
   optimizeAround(M, I, patient, nodesNear(M, I.k), report);
-  report.smoothed = qualityStatistics(M);
+  report.smoothed = report.optimization.quality;
   I.progress("3.7 optimization: " + std::to_string(report.optimization.sweeps) + " sweeps, " +
              std::to_string(report.smoothed.inverted) + " inverted, min " +
              number(report.smoothed.min) + ", mean " + number(report.smoothed.mean));
@@ -6829,7 +6876,7 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
     InsertReport after = report;
     optimizeAround(trial, I, true, active, after);
     if (after.optimization.inverted > 0) return;
-    after.smoothed = qualityStatistics(trial);
+    after.smoothed = after.optimization.quality;
     measureSurface(trial, I.S, after);
     I.progress("3.7 refined where S_M is far from S: " + number(after.hausdorff / lc) + " l_c, " +
                std::to_string(trial.tets.size()) + " tetrahedra, min " +
@@ -6846,7 +6893,7 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
 ///   returns  false: put aside
 bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
             InsertReport& report) {
-  Mesh trial = I.layer.M;
+  Mesh trial;
   InsertReport ofThisWay;
   ofThisWay.original = report.original;
   ofThisWay.surface = I.k, ofThisWay.lc = lc;
@@ -6884,21 +6931,25 @@ void checkFacesApart(Insertion& I) {
 }
 
 /// §3.2 and §3.3: 𝓣 and its squares.
-void approximate(Insertion& I, const Mesh& M, double lc) {
-  I.layer.M = M;
+void approximate(Insertion& I, double lc) {
+  I.layer.M = I.original;
+  I.layer.lc = lc;
   Bisection B(I.layer.M);
   I.layer.A = volumetricApproximation(B, I.S, lc);
   I.stage("approximated", I.layer.M);
   checkFacesApart(I);
   volumetricHealing(B, I.layer.A);
+  I.layer.neighbour = std::move(B.neighbour);
   trim(I.layer.M);
 }
 
 /// The same of its middle, in the mesh as 𝓣 left it.
 void approximateMiddle(Insertion& I) {
-  Bisection B(I.layer.M);
+  restoreLayer(I);
+  Bisection B(I.layer.M, std::move(I.layer.neighbour));
   I.layer.A = middleApproximation(B, I.layer.A, I.S);
   volumetricHealing(B, I.layer.A);
+  I.layer.neighbour = std::move(B.neighbour);
 }
 
 /// The squares of 𝓣, or of its middle, and what they know of S.
@@ -6967,8 +7018,8 @@ void tryMiddle(Insertion& I, const std::vector<Way>& aside, Enough isEnough, dou
 
 /// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
 /// report.
-void insertWithSize(Insertion& I, const Mesh& M, double lc, Mesh& result, InsertReport& report) {
-  approximate(I, M, lc);
+void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report) {
+  approximate(I, lc);
   survey(I);
   // [choice] below this lowest q the middle is tried as well, at any size
   const double enough = std::min({.45, goodQuality(I.layer.M.tets.size()), report.original.min});
@@ -7049,8 +7100,9 @@ std::string advice(const Insertion& I, const Mesh& M, double largest, double lc)
 
 /// The search for l_c: the first of the sizes with a valid mesh, within the tolerance where one is
 /// wanted. A size after the first that asks for too many tetrahedra ends it.
-void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, Mesh& result,
+void searchSize(Insertion& I, const std::vector<double>& sizes, Mesh& result,
                 InsertReport& report) {
+  const Mesh& M = I.original;
   constexpr int maxTries = 2;  // [choice] of a given l_c, with ways that were followed to the end
   const double E = I.options.tolerance;
   const InsertReport start = report;
@@ -7065,7 +7117,7 @@ void searchSize(Insertion& I, const Mesh& M, const std::vector<double>& sizes, M
       checkSize(M, I.S, sizes[i], I.options.maxTets);
       last = sizes[i];
       report = start;
-      insertWithSize(I, M, last, result, report);
+      insertWithSize(I, last, result, report);
       if (report.surface > 0 && (E == 0 || report.hausdorff <= E)) return;
       if (report.surface > 0) {
         I.leave("l_c = " + number(last),
@@ -7178,7 +7230,7 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
   report.original = original;
 
   SizeChoice chosen;
-  Insertion I{cleaned, options, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
+  Insertion I{M, cleaned, options, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
   if (options.lc == 0 && options.tolerance == 0) {
     chosen = chooseSize(M, cleaned);
     I.progress("3.2 l_c = " + number(chosen.lc) + " chosen: " + describe(chosen));
@@ -7186,7 +7238,7 @@ InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOp
   const std::vector<double> sizes = sizesToTry(M, cleaned, options, chosen);
   checkDistances(M, cleaned, sizes[0]);
   Mesh result;
-  searchSize(I, M, sizes, result, report);
+  searchSize(I, sizes, result, report);
   report.size = chosen;
   std::vector<std::string> warnings = candidate.warnings;
   if (options.tolerance == 0 && report.lc < sizes[0])

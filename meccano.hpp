@@ -237,6 +237,7 @@ struct OptimizeReport {
   bool converged = false;
   int inverted = 0;  // elements with σ <= 0 left
   double minQ = 0, meanQ = 0;
+  QualityStatistics quality = {};  // of the mesh as it is left
 };
 
 /// [§3.5] How the outline of S_M is healed: by cases 1 and 2, or [departure] by rim regularization
@@ -393,6 +394,7 @@ struct Bisection {
   std::vector<Split> splits;  // log
 
   explicit Bisection(Mesh& M);
+  Bisection(Mesh& M, std::vector<std::array<int, 4>> neighbour);  // where it is known
   /// Kossaczký's method: first neighbours with another refinement edge, then the whole ring at
   /// once.
   void bisect(int E, int depth = 0);

@@ -1941,10 +1941,10 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
 
   S.report.converged = untangleAndSmooth(S);
   if (S.report.converged && options.power > 1) liftWorst(S);
-  const QualityStatistics q = qualityStatistics(M);
-  S.report.inverted = q.inverted;
-  S.report.minQ = q.min;
-  S.report.meanQ = q.mean;
+  S.report.quality = qualityStatistics(M);
+  S.report.inverted = S.report.quality.inverted;
+  S.report.minQ = S.report.quality.min;
+  S.report.meanQ = S.report.quality.mean;
   return S.report;
 }
 
