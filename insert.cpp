@@ -4322,6 +4322,7 @@ bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
     hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
   }
   const Vec3 margin = 1e-9 * (hi - lo);
+  if (!boxesMeet(S.tree.nodes[0].box, lo - margin, hi + margin)) return false;
   const FacePlanes planes(tet);
   bool hit = false;
   S.tree.visit(lo - margin, hi + margin,
@@ -6702,7 +6703,7 @@ Vec3 firstInverted(const Mesh& M) {
 
 /// [choice] From so many elements on a way takes the refined mesh for itself instead of a copy, a
 /// fifth of all memory; most meshes of this size need but one way.
-constexpr std::size_t tooLargeToCopy = 500000;
+constexpr std::size_t tooLargeToCopy = 200000;
 
 /// §3.4's labels and 3.5 on the refined mesh. Returns the rounds of healing.
 int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {

@@ -678,16 +678,18 @@ struct Smoother {
 
 /// The scale that makes the mean of σ 1 (of a wildly tangled mesh .1 of the mean |σ|), so that μ
 /// and δ are relative.
-double idealScale(const Mesh& M, const IdealElements& ideals) {
+struct IdealScale {
   double sum = 0, absolute = 0;
-  for (std::size_t E = 0; E < M.tets.size(); ++E) {
-    const double sigma = signedVolume6(cornersOf(M.x, M.tets[E])) / signedVolume6(ideals.of(E));
+
+  void add(double sigma) {
     sum += sigma;
     absolute += std::abs(sigma);
   }
-  const double mean = std::max(sum, .1 * absolute) / static_cast<double>(M.tets.size());
-  return mean > 0 ? std::cbrt(mean) : 1;
-}
+  double of(std::size_t elements) const {
+    const double mean = std::max(sum, .1 * absolute) / static_cast<double>(elements);
+    return mean > 0 ? std::cbrt(mean) : 1;
+  }
+};
 
 /// Numbers of shapes of ideal elements. Neighbours in a list are mostly of few shapes: the shapes
 /// that the last ones had are looked up first, by a hash of their edges.
@@ -727,14 +729,18 @@ class ShapeTable {
 /// Corners of the ideal elements; [choice] those whose edges agree as floats are one shape.
 void buildCorners(Smoother& S) {
   const IdealElements ideals(S.M, Ideal::computational);
-  const double scale = idealScale(S.M, ideals);
+  IdealScale sigmas;
   ShapeTable known;
+  std::vector<std::array<Vec3, 4>> shapes;
   S.shapeOf.resize(S.M.tets.size());
   for (std::size_t E = 0; E < S.M.tets.size(); ++E) {
     const std::array<Vec3, 4> z = ideals.of(E);
-    const std::size_t count = known.size();
+    sigmas.add(signedVolume6(cornersOf(S.M.x, S.M.tets[E])) / signedVolume6(z));
     S.shapeOf[E] = known.numberOf(z);
-    if (known.size() == count) continue;
+    if (known.size() > shapes.size()) shapes.push_back(z);
+  }
+  const double scale = sigmas.of(S.M.tets.size());
+  for (const std::array<Vec3, 4>& z : shapes) {
     S.gradients.emplace_back();
     for (std::size_t k = 0; k < 4; ++k) {
       const Mat3 g = barycentricGradients(z, k, scale);
@@ -829,21 +835,21 @@ void buildStars(Smoother& S) {
 struct SheetFace {
   int label;
   std::array<int, 3> v;
-  double area;  // twice, in 𝓤; 0: a parameter is not known
-  bool operator<(const SheetFace& other) const { return key() < other.key(); }
-  std::array<int, 4> key() const {
-    std::array<int, 3> s = v;
-    std::sort(s.begin(), s.end());
-    return {label, s[0], s[1], s[2]};
-  }
+  double area;             // twice, in 𝓤; 0: a parameter is not known
+  std::array<int, 4> key;  // label and sorted nodes
 };
+
+std::array<int, 4> sheetKey(int label, std::array<int, 3> v) {
+  std::sort(v.begin(), v.end());
+  return {label, v[0], v[1], v[2]};
+}
 
 /// The labelled faces, each once.
 std::vector<SheetFace> sheetFaces(const Mesh& M) {
   std::vector<SheetFace> faces;
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int k = 0; k < 4; ++k) {
-      SheetFace f{M.faceLabel[E][k], {}, 0};
+      SheetFace f{M.faceLabel[E][k], {}, 0, {}};
       if (f.label == 0) continue;
       Vec2 u[3];
       bool known = true;
@@ -852,10 +858,12 @@ std::vector<SheetFace> sheetFaces(const Mesh& M) {
         known = known && parameterOn(M, f.v[i], f.label, u[i]);
       }
       if (known) f.area = cross(u[1] - u[0], u[2] - u[0]);
+      f.key = sheetKey(f.label, f.v);
       faces.push_back(f);
     }
-  std::sort(faces.begin(), faces.end());
-  const auto same = [](const SheetFace& a, const SheetFace& b) { return a.key() == b.key(); };
+  std::sort(faces.begin(), faces.end(),
+            [](const SheetFace& a, const SheetFace& b) { return a.key < b.key; });
+  const auto same = [](const SheetFace& a, const SheetFace& b) { return a.key == b.key; };
   faces.erase(std::unique(faces.begin(), faces.end(), same), faces.end());
   return faces;
 }
@@ -1736,32 +1744,41 @@ constexpr double liftReach = .03;  // change of (η/η_w)^power from one round t
 /// others would be lifted farther than what is lowest, with more (1.07) sets of faults end lower.
 constexpr double liftRatio = 1.3;
 
-/// q of the elements that the sweeps have reached (the others, as those at earlier surfaces, were
-/// lifted before), the lowest, the mean, and what bounds the worst of them from above.
+/// The elements that the sweeps have reached (the others, as those at earlier surfaces, were lifted
+/// before), their q, the lowest, the mean, and what bounds the worst of them from above.
 struct WorstElements {
-  static constexpr double notReached = 2;  // above every q
-  std::vector<double> q;                   // [tets]
+  std::vector<int> element;
+  std::vector<double> q;  // [element]
   double lowest = 1, mean = 1, bound = 1;
 };
 
+bool isAtAny(const std::vector<unsigned char>& marked, const std::array<int, 4>& z) {
+  return marked[z[0]] || marked[z[1]] || marked[z[2]] || marked[z[3]];
+}
+
+WorstElements reachedElements(Smoother& S) {
+  WorstElements worst;
+  for (std::size_t E = 0; E < S.M.tets.size(); ++E)
+    if (isAtAny(S.reached, S.M.tets[E])) worst.element.push_back(static_cast<int>(E));
+  worst.q = qualitiesOf(S, worst.element);
+  S.moved.assign(S.moved.size(), 0);
+  return worst;
+}
+
 /// Anew after sweeps: q of the elements at nodes that have moved since, and what follows from them.
 void updateWorst(Smoother& S, WorstElements& worst) {
-  const auto isAtAny = [&S](const std::vector<unsigned char>& marked, std::size_t E) {
-    const std::array<int, 4>& z = S.M.tets[E];
-    return marked[z[0]] || marked[z[1]] || marked[z[2]] || marked[z[3]];
-  };
-  worst.q.resize(S.M.tets.size(), worst.notReached);
-  std::vector<int> changed;
-  for (std::size_t E = 0; E < worst.q.size(); ++E)
-    if (worst.q[E] == worst.notReached ? isAtAny(S.reached, E) : isAtAny(S.moved, E))
-      changed.push_back(static_cast<int>(E));
-  const std::vector<double> now = qualitiesOf(S, changed);
+  std::vector<int> changed;  // places in worst.element
+  std::vector<int> elements;
+  for (std::size_t i = 0; i < worst.q.size(); ++i)
+    if (isAtAny(S.moved, S.M.tets[worst.element[i]])) {
+      changed.push_back(static_cast<int>(i));
+      elements.push_back(worst.element[i]);
+    }
+  const std::vector<double> now = qualitiesOf(S, elements);
   for (std::size_t i = 0; i < changed.size(); ++i) worst.q[changed[i]] = now[i];
   S.moved.assign(S.moved.size(), 0);
 
-  std::vector<double> q;
-  for (double value : worst.q)
-    if (value != worst.notReached) q.push_back(value);
+  std::vector<double> q = worst.q;
   if (q.empty()) return;
   const double count = static_cast<double>(q.size());
   const std::size_t wanted = std::max(worstCount, static_cast<std::size_t>(worstFraction * count));
@@ -1783,9 +1800,9 @@ void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, d
   S.penalty = {1, qw, power};
   S.relaxation = S.options.relaxation;
   S.wake = wake;
-  for (std::size_t E = 0; E < worst.q.size(); ++E)
-    if (worst.q[E] < reach)
-      for (int n : S.M.tets[E]) wakeNode(S, n);
+  for (std::size_t i = 0; i < worst.q.size(); ++i)
+    if (worst.q[i] < reach)
+      for (int n : S.M.tets[worst.element[i]]) wakeNode(S, n);
   for (int k = 0; k < sweeps && sweepsLeft(S); ++k)
     if (sweepNodes(S) <= liftMaxDisp) return;
 }
@@ -1795,7 +1812,7 @@ void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, d
 /// where the lowest q rises no more. A last round with η_w that of the worst element lets all the
 /// others relax and wins the mean back.
 void liftWorst(Smoother& S) {
-  WorstElements worst;
+  WorstElements worst = reachedElements(S);
   updateWorst(S, worst);
   const double meanAtStart = worst.mean;
   if (worst.lowest > perfect) return;

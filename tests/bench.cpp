@@ -2,6 +2,7 @@
 //
 // `make bench`: seconds of each stage of insertSurface, tetrahedra per second, sweeps, the
 // process's peak memory per tetrahedron, and the exponent of the growth from one size to the next.
+// Then what the seventh of seven surfaces costs.
 // The surface is §4.1's sine, A = .1, finer than the mesh at each size.
 #include <sys/resource.h>
 
@@ -95,6 +96,36 @@ Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
   return run;
 }
 
+/// Seven sheets beside each other, .3 apart, one after the other: the CPU seconds of the seventh
+/// against those of the same sheet alone in the same box.
+void benchSeventh() {
+  const int cells = 5;
+  const Mesh box = boxMesh({0, 0, 0}, {4, 2, 1}, {4 * cells, 2 * cells, cells});
+  InsertOptions options;
+  options.lc = .045, options.optimize.threads = 1;
+  const auto sheetAt = [](int place) {
+    TriangleSurface S = samples::sine(.1, 64);
+    for (Vec3& p : S.points) p = p + Vec3{double(place / 2), double(place % 2), 0};
+    return S;
+  };
+  const auto seconds = [&](const Mesh& start, int place, Mesh& M) {
+    double least = 1e300;
+    for (int k = 0; k < 3; ++k) {
+      M = start;
+      Clock clock(false);
+      insertSurface(M, sheetAt(place), options);
+      least = std::min(least, clock.lap());
+    }
+    return least;
+  };
+  Mesh six = box, M;
+  for (int place = 0; place < 6; ++place) insertSurface(six, sheetAt(place), options);
+  const double alone = seconds(box, 6, M), seventh = seconds(six, 6, M);
+  std::printf(
+      "seven sheets, l_c = .045, %d tetrahedra: the seventh %.3f s, alone %.3f s, ratio %.2f\n",
+      static_cast<int>(M.tets.size()), seventh, alone, seventh / alone);
+}
+
 }  // namespace
 
 /// bench [--paper] [COUNT]: the first COUNT sizes, 4 without; 5: 1.6 million tetrahedra.
@@ -121,4 +152,5 @@ int main(int argc, char** argv) {
                 one.optimizing / two.optimizing);
     last = one;
   }
+  if (!paper) benchSeventh();
 }
