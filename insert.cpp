@@ -6552,6 +6552,11 @@ void trim(Mesh& M) {
   M.type.shrink_to_fit(), M.level.shrink_to_fit();
 }
 
+void trim(Layer& layer) {
+  trim(layer.M);
+  layer.neighbour.shrink_to_fit();
+}
+
 /// §3.2 and §3.3 again, for the layer whose mesh was taken.
 void restoreLayer(Insertion& I) {
   Layer& layer = I.layer;
@@ -6567,7 +6572,7 @@ void restoreLayer(Insertion& I) {
     volumetricHealing(again, A);
     layer.neighbour = std::move(again.neighbour);
   }
-  trim(layer.M);
+  trim(layer);
 }
 
 /// §3.4 on both sides: the ways to go on with this outline, best first.
@@ -6941,7 +6946,7 @@ void approximate(Insertion& I, double lc) {
   checkFacesApart(I);
   volumetricHealing(B, I.layer.A);
   I.layer.neighbour = std::move(B.neighbour);
-  trim(I.layer.M);
+  trim(I.layer);
 }
 
 /// The same of its middle, in the mesh as 𝓣 left it.
