@@ -3020,6 +3020,37 @@ constexpr double sampledEps = .97;  // [choice] of ε is held where it is sample
 
 std::string sizeText(const Mesh& M) { return std::to_string(M.tets.size()) + " tetrahedra"; }
 
+[[noreturn]] void refuseSize(const MesherOptions& options, double predicted) {
+  throw InputError("meccanoMesher (§2): eps = " + number(options.eps) + " asks for about " +
+                   number(predicted) + " tetrahedra, above the limit of " +
+                   std::to_string(options.maxTets) + "; raise eps or the limit");
+}
+
+/// The sum over a closed surface's edges of length × angle between the normals beside it.
+double bendOf(const TriangleSurface& D) {
+  std::map<std::pair<int, int>, Vec3> normalAt;  // of the triangle to the left of an edge
+  for (const std::array<int, 3>& t : D.triangles) {
+    const Vec3 n = cross(D.points[t[1]] - D.points[t[0]], D.points[t[2]] - D.points[t[0]]);
+    for (int e = 0; e < 3; ++e) normalAt[{t[e], t[(e + 1) % 3]}] = n;
+  }
+  double bend = 0;
+  for (const auto& [edge, n] : normalAt)
+    if (const auto other = normalAt.find({edge.second, edge.first});
+        edge.first < edge.second && other != normalAt.end())
+      bend += norm(D.points[edge.second] - D.points[edge.first]) *
+              std::atan2(norm(cross(n, other->second)), dot(n, other->second));
+  return bend;
+}
+
+/// [choice] Tetrahedra of a solid's mesh, before any work: a face as long as s misses a bend by
+/// s × bend / 8, so that their number goes with N = Σ length × bend / ε. Measured on spheres, bumps
+/// and scans .97 N (N = 836), 1.4 (2500), 1.7 to 2.6 (8000 to 21000), 3 to 4.6 (25000 to 63000).
+double predictedTets(const TriangleSurface& D, double eps) {
+  constexpr double least = .9, reference = 836, power = .25, most = 5;
+  const double N = bendOf(D) / eps;
+  return N * std::min(most, least * std::max(1., std::pow(N / reference, power)));
+}
+
 /// The error of a face falls with its area: so many tetrahedra will be there at eps.
 double predictedTets(const Mesh& M, const BoundaryDistance& d, double eps) {
   double faces = 0, wanted = 0;
@@ -3042,10 +3073,7 @@ int refineToDistance(Mesher& W, double eps) {
     const BoundaryDistance& d = known.d;
     if (d.largest() <= eps) return pass;
     const double predicted = predictedTets(W.M, d, eps);
-    if (predicted > W.options.maxTets)
-      throw InputError("meccanoMesher (§2): eps = " + number(W.options.eps) + " asks for about " +
-                       number(predicted) + " tetrahedra, above the limit of " +
-                       std::to_string(W.options.maxTets) + "; raise eps or the limit");
+    if (predicted > W.options.maxTets) refuseSize(W.options, predicted);
     const TriangleList tau = getTrianglesToRefine(W.M, d, eps);
     for (const BoundaryTriangle& t : tau)
       if (W.M.level[t.E] >= mostLevels)
@@ -3384,6 +3412,8 @@ MesherReport meccanoMesher(Mesh& M, const TriangleSurface& Omega, const MesherOp
   checkOptions(options);
   std::vector<std::string> warnings;
   const TriangleSurface solid = checkSolid(Omega, warnings);
+  const double predicted = predictedTets(solid, options.eps);
+  if (predicted > options.maxTets) refuseSize(options, predicted);
   const Meccano D = options.meccano.cubes.empty() ? getMeccano(solid) : options.meccano;
   const BoundaryMapping Pi = getBoundaryMapping(D, solid);
   if (options.onProgress) {
@@ -4679,29 +4709,191 @@ struct Cubes {
   }
 };
 
+/// A weighted graph on cubes, for minimumCut(). Directions: −x, +x, −y, +y, −z, +z.
+struct CubeGraph {
+  using Weight = std::int64_t;                // whole numbers: no rounding
+  std::vector<std::array<int, 6>> next;       // [cubes], the neighbours; −1: none
+  std::vector<std::array<Weight, 6>> weight;  // [cubes], of the faces: what a cut there costs
+  std::vector<Weight> above;                  // [cubes], what it costs not to be above S, or,
+};                                            // where it is negative, not to be below
+
+/// Sends as much as a path of the graph takes from the cube to one that wants to be below; the path
+/// goes from level to level. False where there is no path any more.
+bool sendAlongPath(CubeGraph& G, int source, const std::vector<int>& level,
+                   std::vector<int>& direction) {
+  std::vector<std::pair<int, int>> path;
+  int c = source;
+  while (G.above[c] >= 0) {
+    int& d = direction[c];
+    while (d < 6 && (G.weight[c][d] == 0 || level[G.next[c][d]] != level[c] + 1)) ++d;
+    if (d == 6 && path.empty()) return false;
+    if (d < 6) {
+      path.push_back({c, d});
+      c = G.next[c][d];
+    } else {
+      c = path.back().first, path.pop_back();
+      ++direction[c];
+    }
+  }
+  CubeGraph::Weight amount = std::min(G.above[source], -G.above[c]);
+  for (const auto& [from, d] : path) amount = std::min(amount, G.weight[from][d]);
+  for (const auto& [from, d] : path)
+    G.weight[from][d] -= amount, G.weight[G.next[from][d]][d ^ 1] += amount;
+  G.above[source] -= amount, G.above[c] += amount;
+  return true;
+}
+
+/// The cut of least weight: which cubes are above it. By Dinic's algorithm: flow from those that
+/// want to be above to those that want to be below, on shortest paths until there is none.
+std::vector<char> minimumCut(CubeGraph G) {
+  const int cubes = static_cast<int>(G.next.size());
+  std::vector<int> level, queue;
+  for (bool reaches = true; reaches;) {  // each round's paths are longer: at most as many as cubes
+    level.assign(cubes, -1), queue.clear();
+    for (int c = 0; c < cubes; ++c)
+      if (G.above[c] > 0) level[c] = 0, queue.push_back(c);
+    reaches = false;
+    for (std::size_t i = 0; i < queue.size(); ++i) {
+      const int c = queue[i];
+      reaches = reaches || G.above[c] < 0;
+      for (int d = 0; d < 6; ++d)
+        if (G.weight[c][d] > 0 && level[G.next[c][d]] < 0)
+          level[G.next[c][d]] = level[c] + 1, queue.push_back(G.next[c][d]);
+    }
+    std::vector<int> direction(cubes, 0);
+    for (int c = 0; reaches && c < cubes; ++c)
+      while (G.above[c] > 0 && sendAlongPath(G, c, level, direction)) {
+      }
+  }
+  std::vector<char> isAbove(cubes);
+  for (int c = 0; c < cubes; ++c) isAbove[c] = level[c] >= 0;
+  return isAbove;
+}
+
+/// The cubes of a layer around S, and what a cut between those above S_M and those below costs:
+/// each square 1, and each cube on the wrong side of S perDistance times its distance from S, in h.
+/// What lies beyond the layer is on its own side, and so are the cubes that touch an earlier
+/// surface or the boundary: S_M must not pass there.
+CubeGraph graphOf(const Mesh& M, const Approximation& layer, const Cubes& cubes,
+                  const SurfaceDistance& S, double perDistance) {
+  constexpr CubeGraph::Weight perSquare = 1000, firm = 1000000 * perSquare;
+  const Lattice lattice(layer.level);
+  const double perH = lattice.scale / std::cbrt(M.cube.x * M.cube.y * M.cube.z);
+  CubeGraph G;
+  for (std::size_t c = 0; c < cubes.keys.size(); ++c) {
+    const SurfaceQuery at = S.query(cubes.centres[c]);
+    G.above.push_back(std::llround(perDistance * perSquare * perH * at.side));
+    G.next.emplace_back(), G.weight.emplace_back();
+    for (int d = 0; d < 6; ++d) {
+      std::array<std::int64_t, 3> beyond = Lattice::position(cubes.keys[c]);
+      beyond[d / 2] += d % 2 ? 2 : -2;
+      G.next[c][d] = cubes.number.get(Lattice::key(beyond)) - 1;
+      G.weight[c][d] = G.next[c][d] < 0 ? 0 : perSquare;
+      if (G.next[c][d] < 0 && !at.onRim) G.above[c] += at.side >= 0 ? perSquare : -perSquare;
+    }
+  }
+  for (int E : elementsOf(layer.T))
+    for (int n : M.tets[E])
+      if (M.dimension[n] < 3 && lattice.isNode(M.xi[n]))
+        G.above[cubes.number.get(lattice.cubeOf(M, E)) - 1] =
+            S.query(M.x[n]).side >= 0 ? firm : -firm;
+  return G;
+}
+
+/// A lattice node of the cube: corner 0 to 7.
+std::uint64_t cornerOf(std::uint64_t cube, int corner) {
+  const std::array<std::int64_t, 3> p = Lattice::position(cube);
+  return Lattice::key(
+      {p[0] + (corner & 1 ? 1 : -1), p[1] + (corner & 2 ? 1 : -1), p[2] + (corner & 4 ? 1 : -1)});
+}
+
+/// The lattice nodes of 𝓣: place → 1 + mesh node.
+KeyMap nodesOf(const Mesh& M, const Approximation& A) {
+  const Lattice lattice(A.level);
+  KeyMap meshNode;
+  for (int E : elementsOf(A.T))
+    for (int n : M.tets[E])
+      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
+  return meshNode;
+}
+
+/// Whether the element has this point of the computational space; exact, all numbers are dyadic.
+bool holds(const Mesh& M, int E, Vec3 xi) {
+  const std::array<int, 4>& z = M.tets[E];
+  for (int i = 0; i < 4; ++i) {
+    const std::array<int, 3> v = faceOpposite(z, i);
+    const Vec3 normal = cross(M.xi[v[1]] - M.xi[v[0]], M.xi[v[2]] - M.xi[v[0]]);
+    if (dot(normal, xi - M.xi[v[0]]) * dot(normal, M.xi[z[i]] - M.xi[v[0]]) < 0) return false;
+  }
+  return true;
+}
+
+/// Refines the cube of 𝓣's lattice that has this mesh node: all elements that meet it hold its
+/// centre.
+void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
+  const std::array<std::int64_t, 3> p = Lattice::position(cube);
+  const Vec3 centre = (.5 / Lattice(level).scale) * Vec3{double(p[0]), double(p[1]), double(p[2])};
+  std::vector<int> around;
+  for (bool coarse = true; coarse;) {  // one level a round at least
+    coarse = false;
+    B.star(node, around);
+    for (std::size_t i = 0; i < around.size() && !coarse; ++i)
+      if (B.M.level[around[i]] < level && holds(B.M, around[i], centre))
+        B.bisect(around[i]), coarse = true;
+  }
+}
+
+/// The cubes of 𝓣 and all around it, as S_M divides them; their elements are not in the mesh.
+struct DividedCubes {
+  std::vector<std::uint64_t> above, below;  // sorted; of those below the ones that touch one above
+};
+DividedCubes divideCubes(const Mesh& M, const Approximation& A, const SurfaceDistance& S,
+                         double perDistance) {
+  Mesh refined = M;
+  Bisection B(refined);
+  Approximation layer = A;
+  const Lattice lattice(A.level);
+  std::vector<char> seen(M.x.size(), 0);
+  for (int E : elementsOf(A.T))
+    for (int n : M.tets[E])
+      if (lattice.isNode(M.xi[n]) && !seen[n]++ && !isOnBoundary(M, n)) addElementsAt(B, layer, n);
+  const Cubes cubes(refined, layer);
+  const std::vector<char> isAbove = minimumCut(graphOf(refined, layer, cubes, S, perDistance));
+  DividedCubes divided;
+  KeyMap cornersAbove;
+  for (std::size_t c = 0; c < isAbove.size(); ++c) {
+    if (isAbove[c]) divided.above.push_back(cubes.keys[c]);
+    for (int k = 0; k < 8 && isAbove[c]; ++k) cornersAbove[cornerOf(cubes.keys[c], k)] = 1;
+  }
+  for (std::size_t c = 0; c < isAbove.size(); ++c) {
+    bool touches = false;
+    for (int k = 0; k < 8; ++k) touches |= cornersAbove.get(cornerOf(cubes.keys[c], k)) > 0;
+    if (touches && !isAbove[c]) divided.below.push_back(cubes.keys[c]);
+  }
+  std::sort(divided.above.begin(), divided.above.end());
+  std::sort(divided.below.begin(), divided.below.end());
+  return divided;
+}
+
 }  // namespace
 
-Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S) {
-  const Lattice lattice(A.level);
-  const auto isAbove = [&](const Cubes& cubes, int E) {
-    return S.query(cubes.centres[cubes.number.get(lattice.cubeOf(B.M, E)) - 1]).side >= 0;
-  };
-  const Cubes cut(B.M, A);
-  std::vector<char> seen(B.M.x.size(), 0);
-  std::vector<int> lower;  // nodes below S of cubes above
-  for (int E : elementsOf(A.T)) {
-    if (!isAbove(cut, E)) continue;
-    for (int n : B.M.tets[E])
-      if (lattice.isNode(B.M.xi[n]) && !seen[n]++ && !isOnBoundary(B.M, n) &&
-          S.query(B.M.x[n]).side < 0)
-        lower.push_back(n);
+Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S,
+                                  double perDistance) {
+  const DividedCubes cubes = divideCubes(B.M, A, S, perDistance);
+  const KeyMap meshNode = nodesOf(B.M, A);
+  for (std::uint64_t cube : cubes.below) {
+    int node = 0;
+    for (int k = 0; k < 8 && node == 0; ++k) node = meshNode.get(cornerOf(cube, k));
+    if (node > 0) refineCube(B, A.level, cube, node - 1);
   }
-  Approximation layer = A;
-  for (int n : lower) addElementsAt(B, layer, n);
-  const Cubes cubes(B.M, layer);
-  Approximation middle = layer;
-  middle.isMiddle = true;
-  for (int E : elementsOf(layer.T)) middle.T[E] = !isAbove(cubes, E);
+  Approximation middle;
+  middle.level = A.level, middle.isMiddle = true, middle.above = cubes.above;
+  middle.T.assign(B.M.tets.size(), 0);
+  for (std::size_t E = 0; E < middle.T.size(); ++E) {
+    const std::uint64_t cube = Lattice(A.level).cubeOf(B.M, static_cast<int>(E));
+    middle.T[E] =
+        B.M.level[E] >= A.level && std::binary_search(cubes.below.begin(), cubes.below.end(), cube);
+  }
   return middle;
 }
 
@@ -4740,6 +4932,7 @@ void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, S
         }
         s.centre = .25 * (M.x[s.node[0]] + M.x[s.node[1]] + M.x[s.node[2]] + M.x[s.node[3]]);
         s.beyond = 2 * s.centre - cubes.centres[c];
+        s.facesAbove = std::binary_search(A.above.begin(), A.above.end(), Lattice::key(beyond));
         Q.squares.push_back(s);
         Q.keys.push_back(Lattice::key(centre));
       }
@@ -4810,11 +5003,7 @@ SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
   SquareSurface Q;
   Q.level = A.level, Q.isMiddle = A.isMiddle;
   Q.h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) / lattice.scale;
-  KeyMap meshNode;
-  for (int E : elementsOf(A.T))
-    for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
-  addSquares(M, A, meshNode, Q);
+  addSquares(M, A, nodesOf(M, A), Q);
   joinSquares(Q);
   findDiagonals(M, A, Q);
   collectNodes(Q, static_cast<int>(M.x.size()));
@@ -4899,7 +5088,7 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
     isFree = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
     survey.free.push_back(isFree);
     survey.excess.push_back(perH * middle.excess);
-    if (Q.isMiddle) survey.facesUp.push_back(S.query(s.beyond).side >= 0);
+    if (Q.isMiddle) survey.facesUp.push_back(s.facesAbove || S.query(s.beyond).side >= 0);
     std::array<double, 4> beyond{}, above{deep, deep, deep, deep};
     const bool isDeep = triangleWithin(S.rimTree, middle.point, deep * Q.h) < 0;
     for (int e = 0; e < 4 && !isDeep; ++e) {
@@ -6472,11 +6661,16 @@ struct Way {
   Extraction extraction;
 };
 
+/// Where S_M runs: [departure] on the cheapest cut through 𝓣 and what is around it, on a side of 𝓣,
+/// or [departure] between the cubes whose centres are above S and those below.
+enum class Course { cheapest, sides, centres };
+
 /// The mesh refined by §3.2 and §3.3, 𝓣 or its middle, and its squares.
 struct Layer {
   Mesh M = {};                                     // empty where a way has taken it
   std::vector<std::array<int, 4>> neighbour = {};  // of M, as faceNeighbours
   double lc = 0;
+  Course course = Course::sides;
   Approximation A = {};
   SquareSurface Q = {};
   Survey survey = {};
@@ -6557,22 +6751,38 @@ void trim(Layer& layer) {
   layer.neighbour.shrink_to_fit();
 }
 
-/// §3.2 and §3.3 again, for the layer whose mesh was taken.
-void restoreLayer(Insertion& I) {
+/// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
+/// come nearer.
+void checkFacesApart(Insertion& I) {
+  const Gap gap = gapWithin(I.S.tree, I.layer.M.x, facesAround(I.layer.M, I.S, 0), DBL_MIN);
+  if (gap.triangle < 0) return;
+  I.isBlocked = true;
+  throw MethodError("insertSurface (§3.2): S crosses the faces of an earlier surface" + at(gap) +
+                    "; lower l_c");
+}
+
+/// §3.2 and §3.3: 𝓣, or its middle.
+void refineLayer(Insertion& I, bool isAgain) {
+  constexpr double cheapest = 1.5, centres = 1000;  // [choice] of middleApproximation()
   Layer& layer = I.layer;
-  if (!layer.M.tets.empty()) return;
   layer.M = I.original;
   Bisection B(layer.M);
-  Approximation A = volumetricApproximation(B, I.S, layer.lc);
-  volumetricHealing(B, A);
-  layer.neighbour = std::move(B.neighbour);
-  if (layer.A.isMiddle) {
-    Bisection again(layer.M, std::move(layer.neighbour));
-    A = middleApproximation(again, A, I.S);
-    volumetricHealing(again, A);
-    layer.neighbour = std::move(again.neighbour);
+  layer.A = volumetricApproximation(B, I.S, layer.lc);
+  if (!isAgain) I.stage("approximated", layer.M);
+  if (!isAgain) checkFacesApart(I);
+  volumetricHealing(B, layer.A);
+  if (layer.course != Course::sides) {
+    const double perDistance = layer.course == Course::cheapest ? cheapest : centres;
+    layer.A = middleApproximation(B, layer.A, I.S, perDistance);
+    volumetricHealing(B, layer.A);
   }
+  layer.neighbour = std::move(B.neighbour);
   trim(layer);
+}
+
+/// The same again where the mesh was taken.
+void restoreLayer(Insertion& I) {
+  if (I.layer.M.tets.empty()) refineLayer(I, true);
 }
 
 /// §3.4 on both sides: the ways to go on with this outline, best first.
@@ -6926,38 +7136,6 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
   return true;
 }
 
-/// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
-/// come nearer.
-void checkFacesApart(Insertion& I) {
-  const Gap gap = gapWithin(I.S.tree, I.layer.M.x, facesAround(I.layer.M, I.S, 0), DBL_MIN);
-  if (gap.triangle < 0) return;
-  I.isBlocked = true;
-  throw MethodError("insertSurface (§3.2): S crosses the faces of an earlier surface" + at(gap) +
-                    "; lower l_c");
-}
-
-/// §3.2 and §3.3: 𝓣 and its squares.
-void approximate(Insertion& I, double lc) {
-  I.layer.M = I.original;
-  I.layer.lc = lc;
-  Bisection B(I.layer.M);
-  I.layer.A = volumetricApproximation(B, I.S, lc);
-  I.stage("approximated", I.layer.M);
-  checkFacesApart(I);
-  volumetricHealing(B, I.layer.A);
-  I.layer.neighbour = std::move(B.neighbour);
-  trim(I.layer);
-}
-
-/// The same of its middle, in the mesh as 𝓣 left it.
-void approximateMiddle(Insertion& I) {
-  restoreLayer(I);
-  Bisection B(I.layer.M, std::move(I.layer.neighbour));
-  I.layer.A = middleApproximation(B, I.layer.A, I.S);
-  volumetricHealing(B, I.layer.A);
-  I.layer.neighbour = std::move(B.neighbour);
-}
-
 /// The squares of 𝓣, or of its middle, and what they know of S.
 void survey(Insertion& I) {
   Layer& layer = I.layer;
@@ -6978,13 +7156,17 @@ void survey(Insertion& I) {
 /// and above 200k minutes.
 double goodQuality(std::size_t tets) { return tets < 50000 ? .6 : tets < 200000 ? .45 : .3; }
 
+/// Whether no other way is to be tried.
+bool isGood(const Insertion& I, const InsertReport& report) {
+  const double good = std::min(goodQuality(I.layer.M.tets.size()), report.original.min);
+  return report.surface > 0 && (I.lowest >= good || I.options.outline == Outline::paper);
+}
+
 /// The ways of a layer until one is good; those put aside because they stay tangled are returned.
 std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& report) {
   constexpr std::size_t huge = 200000;
   const std::size_t tets = I.layer.M.tets.size();
   const bool isPaper = I.options.outline == Outline::paper;
-  const double good = std::min(goodQuality(tets), report.original.min);
-  auto isGood = [&] { return report.surface > 0 && (I.lowest >= good || isPaper); };
   // [choice] nor, there, whole squares where S_M of half squares is far from S: theirs is as far
   auto isPoor = [&] {
     return tets >= huge && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
@@ -6994,45 +7176,50 @@ std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& re
   std::vector<Selection> tried;
   std::vector<Way> aside;
   for (Outline outline : outlines)
-    if (!isGood() && (outline == outlines[0] || !isPoor()))
+    if (!isGood(I, report) && (outline == outlines[0] || !isPoor()))
       for (const Way& way : extractWays(I, outline)) {
         const Selection& selected = way.extraction.selected;
-        if (isGood() || std::find(tried.begin(), tried.end(), selected) != tried.end()) continue;
+        if (isGood(I, report) || std::find(tried.begin(), tried.end(), selected) != tried.end())
+          continue;
         tried.push_back(selected);
         if (!tryWay(I, way, isPaper, lc, result, report)) aside.push_back(way);
       }
   return aside;
 }
 
-/// [departure] The middle of 𝓣, and [choice] at last the ways of its sides that were put aside.
-template <class Enough>
-void tryMiddle(Insertion& I, const std::vector<Way>& aside, Enough isEnough, double lc,
-               Mesh& result, InsertReport& report) {
-  const Layer sides = I.layer;
-  try {
-    approximateMiddle(I);
-    survey(I);
-    for (const Way& way : tryWays(I, lc, result, report))
-      if (!isEnough()) tryWay(I, way, true, lc, result, report);
-  } catch (const MethodError& error) {
-    I.leave("middle", error);
-  }
-  I.layer = sides;
-  for (const Way& way : aside)
-    if (!isEnough()) tryWay(I, way, true, lc, result, report);
+/// §3.2 and §3.3 for this course.
+void prepare(Insertion& I, double lc, Course course) {
+  I.layer.lc = lc, I.layer.course = course;
+  refineLayer(I, false);
+  survey(I);
 }
 
 /// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
 /// report.
 void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report) {
-  approximate(I, lc);
-  survey(I);
-  // [choice] below this lowest q the middle is tried as well, at any size
-  const double enough = std::min({.45, goodQuality(I.layer.M.tets.size()), report.original.min});
+  std::vector<std::pair<Course, std::vector<Way>>> aside;
+  // [choice] below this lowest q the centres' course is tried, and the ways that were put aside
+  double enough = std::min(.45, report.original.min);
   auto isEnough = [&] { return report.surface > 0 && I.lowest >= enough; };
-  const std::vector<Way> aside = tryWays(I, lc, result, report);
-  if (!isEnough() && I.options.outline != Outline::paper)
-    tryMiddle(I, aside, isEnough, lc, result, report);
+  for (Course course : {Course::cheapest, Course::sides, Course::centres}) {
+    const bool isSides = course == Course::sides;
+    if (!isSides && I.options.outline == Outline::paper) continue;
+    if (course == Course::centres ? isEnough() : isGood(I, report)) continue;
+    try {
+      prepare(I, lc, course);
+      aside.push_back({course, tryWays(I, lc, result, report)});
+    } catch (const MethodError& error) {
+      if (isSides && report.surface == 0) throw;
+      I.leave(isSides ? "sides" : "middle", error);
+    }
+    enough = std::min(enough, goodQuality(I.layer.M.tets.size()));
+  }
+  for (const auto& [course, ways] : aside) {
+    if (ways.empty() || isEnough()) continue;
+    prepare(I, lc, course);
+    for (const Way& way : ways)
+      if (!isEnough()) tryWay(I, way, true, lc, result, report);
+  }
 }
 
 /// [§3.2] The sizes to try one after the other: l_c as given and [choice] its halves; for a

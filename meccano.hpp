@@ -264,9 +264,10 @@ struct InsertOptions {
   bool followRim = true;     // [§3.6 departure] rim correspondence and anchored equations
   int maxTets = 20000000;    // refuse where more tetrahedra are predicted
   OptimizeOptions optimize;  // §3.7; its active and globalDescent are set by the insertion
-  // Called after each stage with the mesh as it is then: "approximated" (3.2), "healed" (3.3, and
-  // again where S_M is taken through the middle of 𝓣), for each way that is tried "extracted"
-  // (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the end "smoothed" (3.7).
+  // Called after each stage with the mesh as it is then: "approximated" (3.2) and "healed"
+  // (3.3) for each course of S_M, through the middle or along a side of 𝓣, and in it for each way
+  // that is tried "extracted" (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the end
+  // "smoothed" (3.7).
   std::function<void(const char* stage, const Mesh&)> onStage = nullptr;
   std::function<void(const std::string& line)> onProgress = nullptr;  // a line per step
   // A callback may throw to stop, but no MethodError or SolverError: M is then unchanged.
@@ -710,6 +711,8 @@ struct Approximation {
   std::vector<char> T;    // [tets], 1: in 𝓣
   int level = 0;          // a multiple of 3: whole cubes
   bool isMiddle = false;  // a middleApproximation()
+  std::vector<std::uint64_t> above =
+      {};  // of a middle: its cubes above S_M, in the lattice, sorted
 };
 /// [§3.2, eq. (1)] Refines the tetrahedra cut by S until none has r^E >= l_c.
 Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc);
@@ -742,8 +745,9 @@ struct Square {
   std::array<int, 4> across;      // square across the edge from corner e to corner e + 1
   std::array<int, 4> acrossEdge;  // that edge's number there
   Vec3 centre;                    // physical
-  Vec3 beyond;       // centre of the cube outside 𝓣, that of the cube inside mirrored
-  int diagonal = 0;  // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
+  Vec3 beyond;              // centre of the cube outside 𝓣, that of the cube inside mirrored
+  bool facesAbove = false;  // of a middle: that cube is above S_M
+  int diagonal = 0;         // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
 };
 /// ∂𝓣 as squares, a topological sphere but for `fault`.
 struct SquareSurface {
@@ -760,11 +764,14 @@ struct SquareSurface {
 /// [§3.3, §3.4] [departure] Where ∂𝓣 is no sphere it says so in `fault`: a pocket in a finger two
 /// cubes wide, or fingers that nearly touch, spoil one side of S and leave S_M a disk on the other.
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
-/// [departure] Where neither side of a healed 𝓣 will do: the cubes whose centres are below S, of 𝓣
-/// and of those refined around the lower nodes of the others. The part of its boundary that faces
-/// up runs through the middle of 𝓣, about half as far from S as the sides of 𝓣. To be healed by
-/// volumetricHealing().
-Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S);
+/// [departure] The cubes below the cheapest S_M and beside it, of 𝓣 and the cubes around it,
+/// refined where they are not: the part of their boundary that faces up. A square of S_M costs 1, a
+/// cube on the wrong side of S `perDistance` times the distance of its centre from S, in h: S_M
+/// makes a step where it pays, and keeps clear of earlier surfaces and the boundary. A large
+/// perDistance lets the centres decide alone. To be healed by volumetricHealing().
+///   source  the minimum cut of a graph; Dinic 1970
+Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S,
+                                  double perDistance);
 
 /// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1
 /// and the centre. 0 nothing, 15 the square; 3, 6, 12, 9 the halves along a diagonal.

@@ -414,6 +414,11 @@ TEST_SUITE("2") {
     S = D;
     for (Vec3& p : S.points) p.z = 0;
     CHECK(has(refusal(S), "checkSolid (§2)"));
+    S.points = {{0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}};  // flat: two squares, back to back
+    S.triangles = {{0, 1, 2}, {0, 2, 3}, {1, 0, 3}, {1, 3, 2}};
+    CHECK(has(refusal(S), "the surface encloses no volume; check its coordinates"));
+    S.points[2].z = .1;
+    CHECK(refusal(S) == "");
     S = D;  // a fin
     S.points.push_back({3, 3, 3});
     S.triangles.push_back({D.triangles[0][0], D.triangles[0][1], n});

@@ -17,6 +17,30 @@ MesherOptions withEps(double eps) {
   return options;
 }
 
+/// A ball with a horn, as high as h, as wide as w.
+TriangleSurface horn(int n, double h, double w) {
+  return solids::ball(n, [h, w](Vec3 p) {
+    return (1 + h * std::exp(-norm2(p - Vec3{.6, .48, .64}) / (w * w))) * p;
+  });
+}
+
+/// The number after `what` in a line.
+double numberAfter(const std::string& line, const std::string& what) {
+  return std::stod(line.substr(line.find(what) + what.size()));
+}
+
+/// The lines of progress that begin so.
+struct Lines {
+  std::vector<std::string> all = {};
+  MesherOptions listen(double eps, const std::string& begin) {
+    MesherOptions options = withEps(eps);
+    options.onProgress = [this, begin](const std::string& line) {
+      if (line.rfind(begin, 0) == 0) all.push_back(line);
+    };
+    return options;
+  }
+};
+
 /// A hill of a smooth formula, 24 x 20 points of 50 m, not symmetric.
 Terrain hill() {
   Terrain T;
@@ -193,6 +217,7 @@ TEST_SUITE("2") {
     };
     for (double eps : {0., -1., std::numeric_limits<double>::infinity()})
       CHECK(has(refusal(hill(), withEps(eps)), "must be above 0"));
+    CHECK(has(refusal(hill(), withEps(1e-3)), "eps = 0.001 is too small for the terrain's grid, "));
     MesherOptions few = withEps(.5);
     few.maxTets = 2000;
     CHECK(has(refusal(hill(), few), "above the limit of 2000; raise eps or the limit"));
@@ -205,6 +230,75 @@ TEST_SUITE("2") {
     broken.z.pop_back();
     CHECK(has(refusal(broken, withEps(4)), "a height for each"));
     CHECK(shapes::sameMesh(M, before));
+  }
+
+  TEST_CASE("qualityOptimization: no face slides farther from the solid than the guard allows") {
+    constexpr double eps = .04, guards[] = {3, 2, .8}, refined = 1;  // of eps: 1 before it slides
+    Lines rounds;
+    Mesh M;
+    meccanoMesher(M, horn(16, 1, .3), rounds.listen(eps, "round"));
+    REQUIRE(rounds.all.size() >= 3);
+    for (int k = 0; k < 3; ++k) {
+      CAPTURE(rounds.all[k]);
+      CHECK(numberAfter(rounds.all[k], "distance ") <= 1.03 * eps * std::max(guards[k], refined));
+    }
+    CHECK(numberAfter(rounds.all[0], "distance ") > eps);  // it does slide
+  }
+
+  TEST_CASE("qualityOptimization: a solid that tangles at once is approached from coarse to fine") {
+    Lines refined, sizes;
+    Mesh M;
+    meccanoMesher(M, solids::blob(16), refined.listen(.04, "refined"));
+    meccanoMesher(M, solids::blob(16), sizes.listen(.04, "fixed boundary"));
+    REQUIRE(refined.all.size() == 1);
+    REQUIRE_FALSE(has(refined.all[0], ", 0 inverted"));
+    REQUIRE(sizes.all.size() > 4);
+    const double atOnce = numberAfter(refined.all[0], "refined: ");
+    double before = 0;
+    for (int k = 0; k < 4; ++k) {  // 16, 8, 4, 2 eps
+      CAPTURE(sizes.all[k]);
+      const double tets = numberAfter(sizes.all[k], "fixed boundary: ");
+      CHECK(has(sizes.all[k], ", 0 inverted"));
+      CHECK(tets > before);
+      CHECK(tets < .8 * atOnce);
+      before = tets;
+    }
+    CHECK(shapes::countInverted(M) == 0);
+  }
+
+  TEST_CASE("qualityOptimization: elements that the guard holds at low quality are bisected") {
+    Lines rounds;
+    Mesh M;
+    const MesherReport r = meccanoMesher(M, horn(20, 3, .15), rounds.listen(.08, "round"));
+    REQUIRE(rounds.all.size() > 3);
+    const double third = numberAfter(rounds.all[2], "min ");
+    REQUIRE(third < .3);
+    CHECK(numberAfter(rounds.all[3], ": ") > numberAfter(rounds.all[2], ": "));  // tetrahedra
+    CHECK(r.smoothed.min > 0);
+    CHECK(shapes::countInverted(M) == 0);
+  }
+
+  TEST_CASE(
+      "meccanoMesher: an eps that the solid's bends tell to be far too small is refused first") {
+    const TriangleSurface S = solids::sphere(12);
+    Mesh M = shapes::kuhnCube();
+    const Mesh before = M;
+    MesherOptions options = withEps(1e-4);
+    options.maxTets = 100000;
+    int lines = 0;
+    options.onProgress = [&](const std::string&) { ++lines; };
+    const std::string text = messageOf([&] { meccanoMesher(M, S, options); });
+    CAPTURE(text);
+    CHECK(has(text, "above the limit of 100000; raise eps or the limit"));
+    CHECK(lines == 0);  // before any work
+    CHECK(shapes::sameMesh(M, before));
+    // a lower bound: what it asks for is there where the limit lets it be
+    options = withEps(.03);
+    meccanoMesher(M, S, options);
+    options.maxTets = static_cast<int>(M.tets.size());
+    Mesh again;
+    meccanoMesher(again, S, options);
+    CHECK(shapes::sameMesh(M, again));
   }
 
   TEST_CASE("qualityOptimization: --max-tets holds in the rounds of sliding, with the message") {

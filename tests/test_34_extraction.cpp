@@ -270,21 +270,60 @@ TEST_SUITE("3.4") {
         double sum = 0;
         const std::set<int> corners = cornersOf(I.Q, X.selected);
         for (int n : corners) sum += I.S.query(I.M.x[n]).distance;
+        int wrong = 0;
         for (std::size_t i = 0; i < I.Q.squares.size(); ++i)
           if (X.selected[i] && side == 0) {
-            CHECK(I.S.query(I.Q.squares[i].beyond).side >= 0);
-            const Vec3 inside = 2 * I.Q.squares[i].centre - I.Q.squares[i].beyond;
-            CHECK(I.S.query(inside).side < 0);
+            const Vec3 beyond = I.Q.squares[i].beyond;
+            wrong += I.S.query(beyond).side < -1e-12;
+            wrong += I.S.query(2 * I.Q.squares[i].centre - beyond).side > 1e-12;
           }
+        CHECK(wrong == 0);
         return sum / static_cast<double>(corners.size());
       };
       ofSides += std::min(meanDistance(1), meanDistance(-1));
-      I.A = middleApproximation(I.B, I.A, I.S);
+      I.A = middleApproximation(I.B, I.A, I.S, 1000);
       I.heal();
       CHECK(I.Q.isMiddle);
       ofMiddle += meanDistance(0);
     }
     CHECK(ofMiddle < .6 * ofSides);
+  }
+
+  TEST_CASE("the middle: steps only where they pay, fewer squares than the centres give") {
+    std::map<double, double> squares;  // of the cases together
+    for (const Try& t : tries())
+      for (double perDistance : {1.5, 1000.}) {
+        Steps I(boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), t.S);
+        I.approximate(t.lc);
+        I.heal();
+        I.A = middleApproximation(I.B, I.A, I.S, perDistance);
+        I.heal();
+        const Extraction X = surfaceExtraction(I.M, I.Q, I.S, 0, Outline::squares);
+        REQUIRE(X.fault == "");
+        squares[perDistance] +=
+            static_cast<double>(std::count(X.selected.begin(), X.selected.end(), 15));
+      }
+    CHECK(squares[1.5] < .97 * squares[1000.]);
+  }
+
+  TEST_CASE("the middle: a bump as high as a cube and two wide is passed under, in one plane") {
+    const TriangleSurface S = samples::sheet(48, 48, [](double s, double t) {
+      const double x = .3 * s, y = .3 * t;
+      return Vec3{.5 + x, .5 + y, .51 + .06 * std::exp(-(x * x + y * y) / (.05 * .05))};
+    });
+    for (double perDistance : {1.5, 1000.}) {
+      CAPTURE(perDistance);
+      Steps I(boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2}), S);
+      I.approximate(.12);  // h = .0625
+      I.heal();
+      I.A = middleApproximation(I.B, I.A, I.S, perDistance);
+      I.heal();
+      const Extraction X = surfaceExtraction(I.M, I.Q, I.S, 0, Outline::squares);
+      REQUIRE(X.fault == "");
+      int off = 0;
+      for (int n : cornersOf(I.Q, X.selected)) off += I.M.xi[n].z != 1;
+      CHECK((off > 0) == (perDistance > 2));
+    }
   }
 
   TEST_CASE("half squares: rules (a) to (d) on the masks, both sides") {

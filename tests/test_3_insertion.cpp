@@ -409,10 +409,10 @@ TEST_SUITE("3") {
 
   TEST_CASE("insertion: a way that stays tangled waits, and a better one is taken") {
     const Mesh before = boxMesh({0, 0, 0}, {1, 1, 1}, {5, 5, 5});
-    const TriangleSurface S = samples::sine2(.1);
+    const TriangleSurface S = samples::sine2(.2);
     Mesh M = before;
     std::vector<std::string> aside;
-    InsertOptions options = withSize(.06);
+    InsertOptions options = withSize(.1);
     options.onProgress = [&](const std::string& line) {
       if (has(line, "put aside")) aside.push_back(line);
     };
