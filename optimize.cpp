@@ -919,9 +919,10 @@ void orientSheets(std::vector<SheetFace>& faces) {
   }
 }
 
-/// Whether a face passes over a slit or an overlap of its surface: in 𝓤 the middle of an edge
-/// belongs to a place farther from it than it is long.
+/// Whether a face passes over a slit or an overlap of an inserted surface: in 𝓤 the middle of an
+/// edge belongs to a place farther from it than it is long. Patches have no slits.
 bool isBridge(const Mesh& M, const SheetFace& f) {
+  if (f.label < 0) return false;
   for (int i = 0; i < 3; ++i) {
     const int a = f.v[i], b = f.v[(i + 1) % 3];
     Vec2 u, v;

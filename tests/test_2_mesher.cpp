@@ -274,7 +274,7 @@ TEST_SUITE("2") {
     const double third = numberAfter(rounds.all[2], "min ");
     REQUIRE(third < .3);
     CHECK(numberAfter(rounds.all[3], ": ") > numberAfter(rounds.all[2], ": "));  // tetrahedra
-    CHECK(r.smoothed.min > 0);
+    CHECK(r.smoothed.min > 2 * third);
     CHECK(shapes::countInverted(M) == 0);
   }
 
