@@ -3308,15 +3308,27 @@ std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
 /// The valid mesh within eps of highest lowest quality so far; before the last rounds any.
 struct BestMesh {
   Mesh M;
-  double lowest = -1;  // none yet
+  double lowest = -1;     // none yet
+  bool isSmooth = false;  // not refined since
 
-  void keep(Mesher& W, double distance, double eps, int round) {
+  void keep(Mesher& W, double distance, double eps, int round, bool smooth) {
     const QualityStatistics q = qualityStatistics(W.M);
     const double reached = round > firstOfLast ? q.min : 0;
     if (q.inverted > 0 || reached < lowest || distance > eps) return;
-    M = W.M, lowest = reached, W.report.rounds = round;
+    M = W.M, lowest = reached, isSmooth = smooth, W.report.rounds = round;
   }
 };
+
+/// Smooths the interior of a mesh that was refined at last; the boundary, which would leave eps
+/// again, stays.
+void smoothInterior(Mesher& W, double eps) {
+  const Mesh refined = W.M;
+  const double lowest = qualityStatistics(W.M).min;
+  const int inverted = untangleFixed(W, true);
+  if (inverted > 0 || qualityStatistics(W.M).min < lowest ||
+      distanceTo(W.M, W.Omega, eps).largest() > eps)
+    W.M = refined;
+}
 
 /// qualityOptimization with ∂Ω prepared; `initial` is the mesh before its refinement.
 void optimizeQuality(Mesher& W, const Mesh& initial) {
@@ -3326,7 +3338,7 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
   W.stage("untangled");
   if (W.options.fixedBoundary) return;
   BestMesh best;
-  best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, 0);
+  best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, 0, false);
   std::vector<int> active;  // none: all
   Slide slide = Slide::between;
   double lowest = 0;
@@ -3339,7 +3351,7 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
     W.progress("round " + std::to_string(round + 1) + ": " + sizeText(W.M) + ", min " +
                number(o.minQ) + ", mean " + number(o.meanQ) + ", distance " + number(d) + ", " +
                std::to_string(o.inverted) + " inverted");
-    best.keep(W, d, eps, round + 1);
+    best.keep(W, d, eps, round + 1, true);
     lowest = o.minQ;
     const std::size_t nodes = W.M.x.size();
     const int stuck = last && o.inverted == 0 ? bisectStuck(W, o.minQ) : 0;
@@ -3348,7 +3360,7 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
     // a few that stay are left to the next round, whose boundary slides
     const int inverted = untangleFixed(W, false);
     if (inverted > fewTangled) break;
-    best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, round + 1);
+    best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, round + 1, false);
     if (last) slide = stuck == 0 && inverted == 0 ? Slide::again : Slide::atLast;
     active = slide == Slide::again ? nodesNear(W.M, nodes) : std::vector<int>{};
   }
@@ -3357,6 +3369,7 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
                       number(W.options.eps) + " after " + std::to_string(rounds) +
                       " rounds; lower eps, or give a polycube that fits the solid better");
   W.M = std::move(best.M);
+  if (!best.isSmooth) smoothInterior(W, eps);
 }
 
 void checkOptions(const MesherOptions& options) {
