@@ -4860,10 +4860,11 @@ void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
 struct DividedCubes {
   std::vector<std::uint64_t> above, below;  // sorted; of those below the ones that touch one above
 };
-DividedCubes divideCubes(const Mesh& M, const Approximation& A, const SurfaceDistance& S,
+DividedCubes divideCubes(const Bisection& start, const Approximation& A, const SurfaceDistance& S,
                          double perDistance) {
+  const Mesh& M = start.M;
   Mesh refined = M;
-  Bisection B(refined);
+  Bisection B(refined, start.neighbour);
   Approximation layer = A;
   const Lattice lattice(A.level);
   std::vector<char> seen(M.x.size(), 0);
@@ -4892,7 +4893,7 @@ DividedCubes divideCubes(const Mesh& M, const Approximation& A, const SurfaceDis
 
 Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S,
                                   double perDistance) {
-  const DividedCubes cubes = divideCubes(B.M, A, S, perDistance);
+  const DividedCubes cubes = divideCubes(B, A, S, perDistance);
   const KeyMap meshNode = nodesOf(B.M, A);
   for (std::uint64_t cube : cubes.below) {
     int node = 0;
