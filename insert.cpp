@@ -3026,19 +3026,22 @@ std::string sizeText(const Mesh& M) { return std::to_string(M.tets.size()) + " t
                    std::to_string(options.maxTets) + "; raise eps or the limit");
 }
 
-/// The sum over a closed surface's edges of length × angle between the normals beside it.
+/// The sum over a closed surface's edges of length × angle between the normals beside it. Sharp
+/// edges, which a patch edge may follow at no cost, do not count.
 double bendOf(const TriangleSurface& D) {
+  constexpr double sharp = .6;                   // [choice] rad
   std::map<std::pair<int, int>, Vec3> normalAt;  // of the triangle to the left of an edge
   for (const std::array<int, 3>& t : D.triangles) {
     const Vec3 n = cross(D.points[t[1]] - D.points[t[0]], D.points[t[2]] - D.points[t[0]]);
     for (int e = 0; e < 3; ++e) normalAt[{t[e], t[(e + 1) % 3]}] = n;
   }
   double bend = 0;
-  for (const auto& [edge, n] : normalAt)
-    if (const auto other = normalAt.find({edge.second, edge.first});
-        edge.first < edge.second && other != normalAt.end())
-      bend += norm(D.points[edge.second] - D.points[edge.first]) *
-              std::atan2(norm(cross(n, other->second)), dot(n, other->second));
+  for (const auto& [edge, n] : normalAt) {
+    const auto other = normalAt.find({edge.second, edge.first});
+    if (edge.first > edge.second || other == normalAt.end()) continue;
+    const double angle = std::atan2(norm(cross(n, other->second)), dot(n, other->second));
+    if (angle < sharp) bend += norm(D.points[edge.second] - D.points[edge.first]) * angle;
+  }
   return bend;
 }
 
@@ -4727,8 +4730,9 @@ struct CubeGraph {
   using Weight = std::int64_t;                // whole numbers: no rounding
   std::vector<std::array<int, 6>> next;       // [cubes], the neighbours; −1: none
   std::vector<std::array<Weight, 6>> weight;  // [cubes], of the faces: what a cut there costs
-  std::vector<Weight> above;                  // [cubes], what it costs not to be above S, or,
-};                                            // where it is negative, not to be below
+  /// [cubes] > 0: what it costs not to be above S_M; < 0: minus what it costs not to be below.
+  std::vector<Weight> above;
+};
 
 /// Sends as much as a path of the graph takes from the cube to one that wants to be below; the path
 /// goes from level to level. False where there is no path any more.
@@ -4858,8 +4862,8 @@ void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
 
 /// The cubes of 𝓣 and all around it, as S_M divides them; their elements are not in the mesh.
 struct DividedCubes {
-  std::vector<std::uint64_t> above, below;  // sorted; of those below the ones that touch one above
-};
+  std::vector<std::uint64_t> above, below, touching;  // sorted; of those below the touching ones
+};                                                    // touch one above
 DividedCubes divideCubes(const Bisection& start, const Approximation& A, const SurfaceDistance& S,
                          double perDistance) {
   const Mesh& M = start.M;
@@ -4882,10 +4886,11 @@ DividedCubes divideCubes(const Bisection& start, const Approximation& A, const S
   for (std::size_t c = 0; c < isAbove.size(); ++c) {
     bool touches = false;
     for (int k = 0; k < 8; ++k) touches |= cornersAbove.get(cornerOf(cubes.keys[c], k)) > 0;
-    if (touches && !isAbove[c]) divided.below.push_back(cubes.keys[c]);
+    if (!isAbove[c]) divided.below.push_back(cubes.keys[c]);
+    if (!isAbove[c] && touches) divided.touching.push_back(cubes.keys[c]);
   }
-  std::sort(divided.above.begin(), divided.above.end());
-  std::sort(divided.below.begin(), divided.below.end());
+  for (std::vector<std::uint64_t>* part : {&divided.above, &divided.below, &divided.touching})
+    std::sort(part->begin(), part->end());
   return divided;
 }
 
@@ -4895,18 +4900,19 @@ Approximation middleApproximation(Bisection& B, const Approximation& A, const Su
                                   double perDistance) {
   const DividedCubes cubes = divideCubes(B, A, S, perDistance);
   const KeyMap meshNode = nodesOf(B.M, A);
-  for (std::uint64_t cube : cubes.below) {
+  for (std::uint64_t cube : cubes.touching) {
     int node = 0;
     for (int k = 0; k < 8 && node == 0; ++k) node = meshNode.get(cornerOf(cube, k));
     if (node > 0) refineCube(B, A.level, cube, node - 1);
   }
   Approximation middle;
-  middle.level = A.level, middle.isMiddle = true, middle.above = cubes.above;
+  middle.level = A.level, middle.isMiddle = true, middle.above = cubes.above,
+  middle.below = cubes.below;
   middle.T.assign(B.M.tets.size(), 0);
   for (std::size_t E = 0; E < middle.T.size(); ++E) {
     const std::uint64_t cube = Lattice(A.level).cubeOf(B.M, static_cast<int>(E));
-    middle.T[E] =
-        B.M.level[E] >= A.level && std::binary_search(cubes.below.begin(), cubes.below.end(), cube);
+    middle.T[E] = B.M.level[E] >= A.level &&
+                  std::binary_search(cubes.touching.begin(), cubes.touching.end(), cube);
   }
   return middle;
 }
@@ -4947,6 +4953,7 @@ void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, S
         s.centre = .25 * (M.x[s.node[0]] + M.x[s.node[1]] + M.x[s.node[2]] + M.x[s.node[3]]);
         s.beyond = 2 * s.centre - cubes.centres[c];
         s.facesAbove = std::binary_search(A.above.begin(), A.above.end(), Lattice::key(beyond));
+        s.facesBelow = std::binary_search(A.below.begin(), A.below.end(), Lattice::key(beyond));
         Q.squares.push_back(s);
         Q.keys.push_back(Lattice::key(centre));
       }
@@ -5102,7 +5109,8 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
     isFree = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
     survey.free.push_back(isFree);
     survey.excess.push_back(perH * middle.excess);
-    if (Q.isMiddle) survey.facesUp.push_back(s.facesAbove || S.query(s.beyond).side >= 0);
+    if (Q.isMiddle)
+      survey.facesUp.push_back(s.facesAbove || (!s.facesBelow && S.query(s.beyond).side >= 0));
     std::array<double, 4> beyond{}, above{deep, deep, deep, deep};
     const bool isDeep = triangleWithin(S.rimTree, middle.point, deep * Q.h) < 0;
     for (int e = 0; e < 4 && !isDeep; ++e) {
@@ -6688,9 +6696,10 @@ struct Layer {
   Approximation A = {};
   SquareSurface Q = {};
   Survey survey = {};
+  std::size_t tets = 0;  // of M, also where it is taken
 };
 
-/// The state of an insertion, from the copy of the caller's mesh on.
+/// The state of an insertion. The caller's mesh stays as it is.
 struct Insertion {
   const Mesh& original;  // the caller's
   const SurfaceDistance& S;
@@ -6775,11 +6784,12 @@ void checkFacesApart(Insertion& I) {
                     "; lower l_c");
 }
 
-/// §3.2 and §3.3: 𝓣, or its middle.
+/// §3.2 and §3.3 on a copy of the caller's mesh: 𝓣, or its middle. isAgain: to the same bytes,
+/// without stages and checks.
 void refineLayer(Insertion& I, bool isAgain) {
   constexpr double cheapest = 1.5, centres = 1000;  // [choice] of middleApproximation()
   Layer& layer = I.layer;
-  layer.M = I.original;
+  layer.M = I.original, layer.A = {};
   Bisection B(layer.M);
   layer.A = volumetricApproximation(B, I.S, layer.lc);
   if (!isAgain) I.stage("approximated", layer.M);
@@ -6791,6 +6801,7 @@ void refineLayer(Insertion& I, bool isAgain) {
     volumetricHealing(B, layer.A);
   }
   layer.neighbour = std::move(B.neighbour);
+  layer.tets = layer.M.tets.size();
   trim(layer);
 }
 
@@ -6799,7 +6810,7 @@ void restoreLayer(Insertion& I) {
   if (I.layer.M.tets.empty()) refineLayer(I, true);
 }
 
-/// §3.4 on both sides: the ways to go on with this outline, best first.
+/// §3.4 on both sides, or in the middle: the ways to go on with this outline, best first.
 std::vector<Way> extractWays(Insertion& I, Outline outline) {
   restoreLayer(I);
   std::vector<Way> ways;
@@ -7172,14 +7183,14 @@ double goodQuality(std::size_t tets) { return tets < 50000 ? .6 : tets < 200000 
 
 /// Whether no other way is to be tried.
 bool isGood(const Insertion& I, const InsertReport& report) {
-  const double good = std::min(goodQuality(I.layer.M.tets.size()), report.original.min);
+  const double good = std::min(goodQuality(I.layer.tets), report.original.min);
   return report.surface > 0 && (I.lowest >= good || I.options.outline == Outline::paper);
 }
 
 /// The ways of a layer until one is good; those put aside because they stay tangled are returned.
 std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& report) {
   constexpr std::size_t huge = 200000;
-  const std::size_t tets = I.layer.M.tets.size();
+  const std::size_t tets = I.layer.tets;
   const bool isPaper = I.options.outline == Outline::paper;
   // [choice] nor, there, whole squares where S_M of half squares is far from S: theirs is as far
   auto isPoor = [&] {
@@ -7208,8 +7219,8 @@ void prepare(Insertion& I, double lc, Course course) {
   survey(I);
 }
 
-/// One l_c: 3.2 to 3.7, on all ways until one is good; the best valid one stays in result and
-/// report.
+/// One l_c: 3.2 to 3.7, on the courses in turn and all ways of each until one is good; the best
+/// valid one stays in result and report.
 void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report) {
   std::vector<std::pair<Course, std::vector<Way>>> aside;
   // [choice] below this lowest q the centres' course is tried, and the ways that were put aside
@@ -7223,10 +7234,10 @@ void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report)
       prepare(I, lc, course);
       aside.push_back({course, tryWays(I, lc, result, report)});
     } catch (const MethodError& error) {
-      if (isSides && report.surface == 0) throw;
+      if (report.surface == 0 && !I.layer.A.isMiddle) throw;  // 𝓣 itself fails, on every course
       I.leave(isSides ? "sides" : "middle", error);
     }
-    enough = std::min(enough, goodQuality(I.layer.M.tets.size()));
+    enough = std::min(enough, goodQuality(I.layer.tets));
   }
   for (const auto& [course, ways] : aside) {
     if (ways.empty() || isEnough()) continue;

@@ -647,7 +647,7 @@ struct SurfaceDistance {
   std::vector<char> isRimPoint;                 // [points]
 
   explicit SurfaceDistance(const TriangleSurface& cleaned);
-  /// `within`: S is known to be nearer, which saves search.
+  /// `within` must be above the distance from S: it saves search.
   SurfaceQuery query(Vec3 x, double within = 1e300) const;
   double rimDistance(Vec3 x) const;  // distance to the rim polyline
 };
@@ -711,8 +711,8 @@ struct Approximation {
   std::vector<char> T;    // [tets], 1: in 𝓣
   int level = 0;          // a multiple of 3: whole cubes
   bool isMiddle = false;  // a middleApproximation()
-  std::vector<std::uint64_t> above =
-      {};  // of a middle: its cubes above S_M, in the lattice, sorted
+  // Of a middle: the cubes above S_M and those below, in the lattice, sorted.
+  std::vector<std::uint64_t> above = {}, below = {};
 };
 /// [§3.2, eq. (1)] Refines the tetrahedra cut by S until none has r^E >= l_c.
 Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc);
@@ -745,9 +745,10 @@ struct Square {
   std::array<int, 4> across;      // square across the edge from corner e to corner e + 1
   std::array<int, 4> acrossEdge;  // that edge's number there
   Vec3 centre;                    // physical
-  Vec3 beyond;              // centre of the cube outside 𝓣, that of the cube inside mirrored
-  bool facesAbove = false;  // of a middle: that cube is above S_M
-  int diagonal = 0;         // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
+  Vec3 beyond;  // centre of the cube outside 𝓣, that of the cube inside mirrored
+  bool facesAbove = false, facesBelow = false;  // of a middle: that cube is known to be above S_M,
+                                                // or below
+  int diagonal = 0;  // the mesh edge that halves it: 0 from corner 0 to 2, 1 from 1 to 3
 };
 /// ∂𝓣 as squares, a topological sphere but for `fault`.
 struct SquareSurface {

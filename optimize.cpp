@@ -1612,6 +1612,7 @@ Functional descend(Smoother& S, double delta, std::vector<LbfgsPair>& pairs) {
     const WolfeStep step = wolfeSearch(goTo, {at.F, slope}, 1, unbounded);
     if (!step.curvature) {
       S.M.x = start;
+      pairs.clear();  // of another δ they may mislead
       return at;
     }
     const bool little = at.F - trial.F < lbfgsDecrease * at.F;

@@ -108,11 +108,12 @@ bool meets(const Result& r, const Floor& floor) {
 
 void printLine(const Case& c, const Result& r, bool figures) {
   char text[256];
-  std::snprintf(
-      text, sizeof text,
-      "%-22s lc %-6.3g %-7s %7d tets  projected %5d  min %.3f mean %.3f std %.3f  H/lc %.2f %6.1f s",
-      c.name.c_str(), r.returned ? r.lc : c.lc, c.paper ? "paper" : "default", r.q.tetrahedra,
-      r.projected, r.q.min, r.q.mean, r.q.stdDev, r.hausdorff / r.lc, r.seconds);
+  std::snprintf(text, sizeof text,
+                "%-22s lc %-6.3g %-7s %7d tets  projected %5d  min %.3f mean %.3f std %.3f  "
+                "H/lc %.2f %6.1f s",
+                c.name.c_str(), r.returned ? r.lc : c.lc, c.paper ? "paper" : "default",
+                r.q.tetrahedra, r.projected, r.q.min, r.q.mean, r.q.stdDev,
+                r.returned ? r.hausdorff / r.lc : 0., r.seconds);
   std::string line = text;
   if (figures) {
     if (c.floor.min < 0)

@@ -299,6 +299,11 @@ TEST_SUITE("2") {
     Mesh again;
     meccanoMesher(again, S, options);
     CHECK(shapes::sameMesh(M, again));
+    // sharp edges, which patch edges follow, ask for nothing
+    options = withEps(1e-6);
+    options.maxTets = 1000;
+    meccanoMesher(again, solids::polycube({{0, 0, 0}}, 4, [](Vec3 p) { return p; }), options);
+    CHECK(again.tets.size() < 1000);
   }
 
   TEST_CASE("qualityOptimization: --max-tets holds in the rounds of sliding, with the message") {
