@@ -4874,7 +4874,10 @@ DividedCubes divideCubes(const Bisection& start, const Approximation& A, const S
   std::vector<char> seen(M.x.size(), 0);
   for (int E : elementsOf(A.T))
     for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n]) && !seen[n]++ && !isOnBoundary(M, n)) addElementsAt(B, layer, n);
+      if (lattice.isNode(M.xi[n]) && !seen[n] && !isOnBoundary(M, n)) {
+        seen[n] = 1;
+        addElementsAt(B, layer, n);
+      }
   const Cubes cubes(refined, layer);
   const std::vector<char> isAbove = minimumCut(graphOf(refined, layer, cubes, S, perDistance));
   DividedCubes divided;
