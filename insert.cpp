@@ -75,6 +75,10 @@ std::uint64_t edgeKey(int a, int b) {
   return lo << 32 | hi;
 }
 
+std::array<int, 3> faceOpposite(const std::array<int, 4>& z, int i) {
+  return {z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
+}
+
 int localIndex(const std::array<int, 4>& tet, int n) {
   for (int i = 0; i < 4; ++i)
     if (tet[i] == n) return i;
@@ -2065,14 +2069,14 @@ std::array<int, 4> sortedCorners(const std::array<int, 4>& z) {
 std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
   const int nodes = static_cast<int>(M.x.size()), count = static_cast<int>(M.tets.size());
   std::vector<std::array<int, 4>> neighbour(count, {-1, -1, -1, -1});
-  // Faces grouped by their smallest node; within a group equal faces are found by comparing the
-  // other two. Of the sorted nodes of an element three faces begin with the first, one with the
-  // second.
+  // Faces grouped by their largest node, the youngest one, at which few elements meet; within a
+  // group equal faces are found by comparing the other two. Of the sorted nodes of an element three
+  // faces end with the last, one with the second to last.
   std::vector<int> start(nodes + 1, 0);
   for (const std::array<int, 4>& z : M.tets) {
     const std::array<int, 4> o = sortedCorners(z);
-    start[z[o[0]] + 1] += 3;
-    ++start[z[o[1]] + 1];
+    start[z[o[3]] + 1] += 3;
+    ++start[z[o[2]] + 1];
   }
   std::partial_sum(start.begin(), start.end(), start.begin());
   struct Waiting {
@@ -2084,7 +2088,7 @@ std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
     const std::array<int, 4>& z = M.tets[E];
     const std::array<int, 4> o = sortedCorners(z);
     for (int k = 0; k < 4; ++k) {
-      const int v0 = z[o[k < 1 ? 1 : 0]], v1 = z[o[k < 2 ? 2 : 1]], v2 = z[o[k < 3 ? 3 : 2]];
+      const int v0 = z[o[k < 3 ? 3 : 2]], v1 = z[o[k < 2 ? 2 : 1]], v2 = z[o[k < 1 ? 1 : 0]];
       const int i = o[k];
       int g = start[v0];
       while (g < filled[v0] && (group[g].v1 != v1 || group[g].v2 != v2)) ++g;
@@ -4425,8 +4429,9 @@ namespace {
 /// The faces of ∂𝓜, of all patches.
 std::vector<std::array<int, 3>> patchFaces(const Mesh& M) {
   std::vector<std::array<int, 3>> faces;
-  for (std::size_t p = 1; p <= M.patches.size(); ++p)
-    for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) faces.push_back(face);
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (M.faceLabel[E][i] < 0) faces.push_back(faceOpposite(M.tets[E], i));
   return faces;
 }
 
@@ -4546,10 +4551,6 @@ struct Lattice {
     return false;
   }
 };
-
-std::array<int, 3> faceOpposite(const std::array<int, 4>& z, int i) {
-  return {z[(i + 1) % 4], z[(i + 2) % 4], z[(i + 3) % 4]};
-}
 
 }  // namespace
 
@@ -5646,13 +5647,13 @@ void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
 
 namespace {
 
-/// S_M as a complex: its nodes, edges and rim, read off the labelled faces.
+/// S_M as a complex: its nodes, edges and rim, read off the labelled faces of some elements.
 struct SurfaceComplex {
   std::vector<char> node;  // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
   KeyMap edges;            // edge → times seen (twice a face): 2 rim, 4 inside
   std::vector<std::pair<int, int>> edgeList;
-  SurfaceComplex(const Mesh& M, int k) : node(M.x.size(), 0) {
-    for (std::size_t E = 0; E < M.tets.size(); ++E)
+  SurfaceComplex(const Mesh& M, int k, const std::vector<int>& elements) : node(M.x.size(), 0) {
+    for (int E : elements)
       for (int i = 0; i < 4; ++i) {
         if (M.faceLabel[E][i] != k) continue;
         const std::array<int, 3> v = faceOpposite(M.tets[E], i);
@@ -5683,24 +5684,37 @@ bool bisectEdges(Bisection& B, const std::vector<std::pair<int, int>>& edges) {
 
 }  // namespace
 
-bool refineTetrahedraWithTwoFaces(Bisection& B, int k) {
+std::vector<int> elementsAt(const Mesh& M, int k) {
+  std::vector<char> on(M.x.size(), 0);
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4; ++i)
+      if (M.faceLabel[E][i] == k)
+        for (int n : faceOpposite(M.tets[E], i)) on[n] = 1;
+  std::vector<int> elements;
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    const std::array<int, 4>& z = M.tets[E];
+    if (on[z[0]] || on[z[1]] || on[z[2]] || on[z[3]]) elements.push_back(static_cast<int>(E));
+  }
+  return elements;
+}
+
+bool refineTetrahedraWithTwoFaces(Bisection& B, int k, const std::vector<int>& near) {
   std::vector<std::pair<int, int>> refine;  // tetrahedron, level
-  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
+  for (int E : near) {
     const std::array<int, 4>& label = B.M.faceLabel[E];
-    if (std::count(label.begin(), label.end(), k) > 1)
-      refine.push_back({static_cast<int>(E), B.M.level[E]});
+    if (std::count(label.begin(), label.end(), k) > 1) refine.push_back({E, B.M.level[E]});
   }
   for (const auto& [E, level] : refine)
     if (B.M.level[E] == level) B.bisect(E);
   return !refine.empty();
 }
 
-bool refineFacesWithTwoRimEdges(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
+bool refineFacesWithTwoRimEdges(Bisection& B, int k, const std::vector<int>& near) {
+  const SurfaceComplex SM(B.M, k, near);
   std::vector<std::pair<int, int>> refine;
-  for (const std::array<int, 4>& z : B.M.tets)
-    for (int i = 0; i < 4 && SM.count(z) > 2; ++i) {
-      const std::array<int, 3> v = faceOpposite(z, i);
+  for (int E : near)
+    for (int i = 0; i < 4 && SM.count(B.M.tets[E]) > 2; ++i) {
+      const std::array<int, 3> v = faceOpposite(B.M.tets[E], i);
       if (SM.node[v[0]] != 2 || SM.node[v[1]] != 2 || SM.node[v[2]] != 2) continue;
       int rimEdges = 0;
       for (int e = 0; e < 3; ++e) rimEdges += SM.isRimEdge(v[e], v[(e + 1) % 3]);
@@ -5709,20 +5723,20 @@ bool refineFacesWithTwoRimEdges(Bisection& B, int k) {
   return bisectEdges(B, refine);
 }
 
-bool refineEdgesAcrossTheRim(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
+bool refineEdgesAcrossTheRim(Bisection& B, int k, const std::vector<int>& near) {
+  const SurfaceComplex SM(B.M, k, near);
   std::vector<std::pair<int, int>> refine;
   for (const auto& [a, b] : SM.edgeList)
     if (SM.node[a] == 2 && SM.node[b] == 2 && !SM.isRimEdge(a, b)) refine.push_back({a, b});
   return bisectEdges(B, refine);
 }
 
-bool refineEdgesBetweenSurfaces(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
+bool refineEdgesBetweenSurfaces(Bisection& B, int k, const std::vector<int>& near) {
+  const SurfaceComplex SM(B.M, k, near);
   std::vector<std::pair<int, int>> refine;
-  for (const std::array<int, 4>& z : B.M.tets)
+  for (int E : near)
     for (const auto& e : tetEdges) {
-      const int a = z[e[0]], b = z[e[1]];
+      const int a = B.M.tets[E][e[0]], b = B.M.tets[E][e[1]];
       if ((SM.node[a] && B.M.dimension[b] < 3 && !SM.node[b]) ||
           (SM.node[b] && B.M.dimension[a] < 3 && !SM.node[a]))
         refine.push_back({a, b});
@@ -5730,10 +5744,10 @@ bool refineEdgesBetweenSurfaces(Bisection& B, int k) {
   return bisectEdges(B, refine);
 }
 
-bool refineToFullSubcomplex(Bisection& B, int k) {
-  const SurfaceComplex SM(B.M, k);
+bool refineToFullSubcomplex(Bisection& B, int k, const std::vector<int>& near) {
+  const SurfaceComplex SM(B.M, k, near);
   std::vector<std::pair<int, int>> refine;
-  for (std::size_t E = 0; E < B.M.tets.size(); ++E) {
+  for (int E : near) {
     const std::array<int, 4>& z = B.M.tets[E];
     if (SM.count(z) < 2) continue;
     for (const auto& e : tetEdges)
@@ -5751,12 +5765,21 @@ bool refineToFullSubcomplex(Bisection& B, int k) {
 
 int surfaceHealing(Bisection& B, int k) {
   constexpr int maxRounds = 30;  // [choice] rounds end after 2 to 5 where they end
+  std::vector<int> near = elementsAt(B.M, k);
+  std::vector<char> isNear(B.M.tets.size(), 0);
+  for (int E : near) isNear[E] = 1;
   for (int round = 1; round <= maxRounds; ++round) {
-    bool changed = refineTetrahedraWithTwoFaces(B, k);
-    changed |= refineFacesWithTwoRimEdges(B, k);
-    changed |= refineEdgesAcrossTheRim(B, k);
-    changed |= refineEdgesBetweenSurfaces(B, k);
-    changed |= refineToFullSubcomplex(B, k);
+    bool changed = false;
+    for (auto rule :
+         {refineTetrahedraWithTwoFaces, refineFacesWithTwoRimEdges, refineEdgesAcrossTheRim,
+          refineEdgesBetweenSurfaces, refineToFullSubcomplex}) {
+      B.splits.clear();
+      changed |= rule(B, k, near);
+      // a new node of S_M lies on an edge of it: the elements there are parts of near ones
+      isNear.resize(B.M.tets.size(), 0);
+      for (const Bisection::Split& split : B.splits)
+        if (isNear[split.parent]) isNear[split.child] = 1, near.push_back(split.child);
+    }
     if (!changed) return round;
   }
   throw MethodError("insertSurface (§3.5): the rules of surface healing do not settle after " +
@@ -6644,10 +6667,7 @@ std::string at(const Gap& gap) {
 
 /// l_c against the distances of §3.1 and §3.2: S inside the domain, and clear of earlier surfaces.
 void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
-  std::vector<std::array<int, 3>> boundary;
-  for (std::size_t p = 1; p <= M.patches.size(); ++p)
-    for (const auto& face : surfaceFaces(M, -static_cast<int>(p))) boundary.push_back(face);
-  const Gap gap = gapWithin(S.tree, M.x, boundary, aboveDiagonal * lc);
+  const Gap gap = gapWithin(S.tree, M.x, patchFaces(M), aboveDiagonal * lc);
   if (gap.distance <= 0 || !contains(M, S.S.points[0]))
     throw InputError("insertSurface (§3.1): S touches or leaves the domain" +
                      (gap.distance <= 0 ? at(gap) : std::string()) + "; it must lie inside");

@@ -803,18 +803,20 @@ bool removeThinProtrusions(const SquareSurface& Q, Selection& selected);
 /// [§3.5.2] Adds the square in the plane of the two rim edges at rim nodes with five or more
 /// triangles.
 bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected);
+/// The elements with a node of S_M, surface k, ascending: the `near` of the rules that follow.
+std::vector<int> elementsAt(const Mesh& M, int k);
 /// [§3.5.3] Refines tetrahedra with more than one face on S_M.
-bool refineTetrahedraWithTwoFaces(Bisection& B, int k);
+bool refineTetrahedraWithTwoFaces(Bisection& B, int k, const std::vector<int>& near);
 /// [§3.5.4] Refines faces with more than one edge on the rim of S_M.
-bool refineFacesWithTwoRimEdges(Bisection& B, int k);
+bool refineFacesWithTwoRimEdges(Bisection& B, int k, const std::vector<int>& near);
 /// [§3.5.5] Refines inner edges of S_M with both ends on its rim.
-bool refineEdgesAcrossTheRim(Bisection& B, int k);
+bool refineEdgesAcrossTheRim(Bisection& B, int k, const std::vector<int>& near);
 /// [§3.5.6] Refines edges that join S_M to another surface or to the boundary.
-bool refineEdgesBetweenSurfaces(Bisection& B, int k);
+bool refineEdgesBetweenSurfaces(Bisection& B, int k, const std::vector<int>& near);
 /// [§3.5] [departure] S_M must be a full subcomplex: bisects each edge with both ends on S_M that
 /// is no edge of it, and splits each face with three nodes on S_M that is no face of it. Where S is
 /// flat such a chord has zero length to give: the six cases alone left no random surface valid.
-bool refineToFullSubcomplex(Bisection& B, int k);
+bool refineToFullSubcomplex(Bisection& B, int k, const std::vector<int>& near);
 /// [§3.5] Cases 3 to 6 and the full subcomplex until nothing changes.
 ///   returns rounds;  errors  MethodError after 30
 int surfaceHealing(Bisection& B, int k);

@@ -647,9 +647,10 @@ struct Smoother {
   OptimizeReport report = {};
   int threads = 1;
 
+  std::vector<int> elements = {};         // those that may change, ascending
   std::vector<IdealCorner> corners = {};  // 4 for each ideal element; few on a meccano mesh
   std::vector<std::array<Vec3, 4>> gradients = {};  // g_0 ... g_3 of each ideal element
-  std::vector<int> shapeOf = {};            // [tets] corners of E: corners[4 shapeOf[E] + vertex]
+  std::vector<int> shapeOf = {};  // [tets] corners of E: corners[4 shapeOf[E] + vertex]; -1: none
   std::vector<unsigned char> freedom = {};  // [nodes] 3 inner, 2 surface, 1 curve, 0 fixed
 
   std::vector<int> order = {};        // [rows] the free nodes, colour by colour
@@ -732,14 +733,14 @@ void buildCorners(Smoother& S) {
   IdealScale sigmas;
   ShapeTable known;
   std::vector<std::array<Vec3, 4>> shapes;
-  S.shapeOf.resize(S.M.tets.size());
-  for (std::size_t E = 0; E < S.M.tets.size(); ++E) {
+  S.shapeOf.assign(S.M.tets.size(), -1);
+  for (int E : S.elements) {
     const std::array<Vec3, 4> z = ideals.of(E);
     sigmas.add(signedVolume6(cornersOf(S.M.x, S.M.tets[E])) / signedVolume6(z));
     S.shapeOf[E] = known.numberOf(z);
     if (known.size() > shapes.size()) shapes.push_back(z);
   }
-  const double scale = sigmas.of(S.M.tets.size());
+  const double scale = sigmas.of(S.elements.size());
   for (const std::array<Vec3, 4>& z : shapes) {
     S.gradients.emplace_back();
     for (std::size_t k = 0; k < 4; ++k) {
@@ -765,20 +766,51 @@ void buildFreedom(Smoother& S) {
   for (int n : S.options.fixed) S.freedom[n] = 0;
 }
 
+bool isAtAny(const std::vector<unsigned char>& marked, const std::array<int, 4>& z) {
+  return marked[z[0]] || marked[z[1]] || marked[z[2]] || marked[z[3]];
+}
+
+/// [choice] Edges from the active nodes to the farthest ones that move.
+constexpr int activeReach = 4;
+
+/// The elements that may change: all, or where the active nodes are given those near them; the
+/// nodes beyond stay.
+void buildElements(Smoother& S) {
+  const std::vector<std::array<int, 4>>& tets = S.M.tets;
+  if (S.options.active.empty()) {
+    S.elements.resize(tets.size());
+    std::iota(S.elements.begin(), S.elements.end(), 0);
+    return;
+  }
+  std::vector<unsigned char> near(S.M.x.size(), 0), next;
+  for (int n : S.options.active) near[n] = 1;
+  for (int edge = 0; edge < activeReach; ++edge) {
+    next = near;
+    for (const std::array<int, 4>& tet : tets)
+      if (isAtAny(near, tet))
+        for (int n : tet) next[n] = 1;
+    near.swap(next);
+  }
+  for (std::size_t n = 0; n < near.size(); ++n)
+    if (!near[n]) S.freedom[n] = 0;
+  for (std::size_t E = 0; E < tets.size(); ++E)
+    if (isAtAny(S.freedom, tets[E])) S.elements.push_back(static_cast<int>(E));
+}
+
 /// Rows of items at nodes: items of n are item[start[n] .. start[n + 1]).
 struct Incidence {
   std::vector<int> start, item;
 };
 Incidence tetsAtFreeNodes(const Smoother& S) {
   Incidence at{std::vector<int>(S.M.x.size() + 1, 0), {}};
-  for (const std::array<int, 4>& tet : S.M.tets)
-    for (int n : tet) at.start[n + 1] += S.freedom[n] > 0;
+  for (int E : S.elements)
+    for (int n : S.M.tets[E]) at.start[n + 1] += S.freedom[n] > 0;
   std::partial_sum(at.start.begin(), at.start.end(), at.start.begin());
   std::vector<int> next(at.start.begin(), at.start.end() - 1);
   at.item.resize(at.start.back());
-  for (std::size_t E = 0; E < S.M.tets.size(); ++E)
+  for (int E : S.elements)
     for (int n : S.M.tets[E])
-      if (S.freedom[n] > 0) at.item[next[n]++] = static_cast<int>(E);
+      if (S.freedom[n] > 0) at.item[next[n]++] = E;
   return at;
 }
 
@@ -844,10 +876,10 @@ std::array<int, 4> sheetKey(int label, std::array<int, 3> v) {
   return {label, v[0], v[1], v[2]};
 }
 
-/// The labelled faces, each once.
-std::vector<SheetFace> sheetFaces(const Mesh& M) {
+/// The labelled faces of these elements, each once.
+std::vector<SheetFace> sheetFaces(const Mesh& M, const std::vector<int>& elements) {
   std::vector<SheetFace> faces;
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
+  for (int E : elements)
     for (int k = 0; k < 4; ++k) {
       SheetFace f{M.faceLabel[E][k], {}, 0, {}};
       if (f.label == 0) continue;
@@ -941,7 +973,7 @@ bool isBridge(const Mesh& M, const SheetFace& f) {
 void buildSheets(Smoother& S) {
   const Mesh& M = S.M;
   if (M.faceLabel.empty() || M.dimension.empty()) return;
-  std::vector<SheetFace> faces = sheetFaces(M);
+  std::vector<SheetFace> faces = sheetFaces(M, S.elements);
   orientSheets(faces);
   std::vector<std::pair<int, SheetTriangle>> entries;
   for (const SheetFace& f : faces) {
@@ -977,13 +1009,13 @@ struct Validity {
 Validity validity(const Smoother& S) {
   const auto ofPiece = [&S](int from, int to) {
     Validity v;
-    for (int E = from; E < to; ++E) {
-      const double sigma = sigmaOf(S, E);
+    for (int i = from; i < to; ++i) {
+      const double sigma = sigmaOf(S, S.elements[i]);
       v += {sigma > 0 ? 0 : 1, sigma};
     }
     return v;
   };
-  return sumOfPieces<Validity>(S.threads, 0, static_cast<int>(S.M.tets.size()), piece, ofPiece);
+  return sumOfPieces<Validity>(S.threads, 0, static_cast<int>(S.elements.size()), piece, ofPiece);
 }
 
 /// q of these elements, from the closed form at their first vertex.
@@ -1230,10 +1262,8 @@ bool sweepsLeft(const Smoother& S) { return S.report.sweeps < S.options.maxSweep
 void countSweep(Smoother& S, double disp) {
   ++S.report.sweeps;
   if (!S.options.onSweep) return;
-  std::vector<int> all(S.M.tets.size());
-  std::iota(all.begin(), all.end(), 0);
-  const std::vector<double> q = qualitiesOf(S, all);
-  const double least = *std::min_element(q.begin(), q.end());
+  const std::vector<double> q = qualitiesOf(S, S.elements);
+  const double least = q.empty() ? 1 : *std::min_element(q.begin(), q.end());
   const int inverted = least > 0 ? 0 : static_cast<int>(std::count(q.begin(), q.end(), 0.));
   S.options.onSweep({S.report.sweeps, inverted, least, disp});
 }
@@ -1342,7 +1372,7 @@ class Anderson {
   bool undoInvalid();
 
   Smoother& S;
-  std::vector<float> sigma_;                     // [tets] after the sweep
+  std::vector<float> sigma_;                     // [elements] after the sweep
   int recorded_ = 0;                             // sweeps since the last restart
   double last_ = 0;                              // |r|² of the last sweep
   std::vector<Vec3> start_, plain_, lastPlain_;  // [rows] x, G(x), and that before
@@ -1377,9 +1407,9 @@ std::array<float, 3> difference(Vec3 a, Vec3 b) {
 
 /// σ after the sweep.
 void Anderson::recordSigma() {
-  sigma_.resize(S.M.tets.size());
+  sigma_.resize(S.elements.size());
   forPieces(S.threads, 0, static_cast<int>(sigma_.size()), piece, [&](int, int from, int to) {
-    for (int E = from; E < to; ++E) sigma_[E] = static_cast<float>(sigmaOf(S, E));
+    for (int i = from; i < to; ++i) sigma_[i] = static_cast<float>(sigmaOf(S, S.elements[i]));
   });
 }
 
@@ -1444,11 +1474,11 @@ constexpr double keptSigma = .5;
 /// Puts the nodes of elements that lost σ and of folded sheets back to G(x). Returns whether there
 /// were any.
 bool Anderson::undoInvalid() {
-  const int tets = static_cast<int>(S.M.tets.size());
-  std::vector<std::vector<int>> lost(tets / piece + 1);
-  forPieces(S.threads, 0, tets, piece, [&](int k, int from, int to) {
-    for (int E = from; E < to; ++E)
-      if (!(sigmaOf(S, E) > keptSigma * sigma_[E])) lost[k].push_back(E);
+  const int count = static_cast<int>(S.elements.size());
+  std::vector<std::vector<int>> lost(count / piece + 1);
+  forPieces(S.threads, 0, count, piece, [&](int k, int from, int to) {
+    for (int i = from; i < to; ++i)
+      if (!(sigmaOf(S, S.elements[i]) > keptSigma * sigma_[i])) lost[k].push_back(S.elements[i]);
   });
   std::vector<int> undone;
   for (const std::vector<int>& ofPiece : lost)
@@ -1498,7 +1528,7 @@ struct Functional {
 /// to 0 there; with 1/8 the cube turned by 3 rad stays tangled.
 constexpr double volumeWeight = 1;
 
-Mat3 jacobianOf(const Smoother& S, std::size_t E) {
+Mat3 jacobianOf(const Smoother& S, int E) {
   const std::array<int, 4>& tet = S.M.tets[E];
   const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
   const Vec3 x = S.M.x[tet[0]];
@@ -1515,19 +1545,20 @@ Functional meshFunctional(const Smoother& S, double delta, std::vector<Vec3>& gr
   Functional sum{0, unbounded};
   gradient.assign(S.M.x.size(), {});
   diagonal.assign(S.M.x.size(), 0);
-  for (std::size_t first = 0; first < S.M.tets.size(); first += lanes) {
-    const int count = static_cast<int>(std::min<std::size_t>(lanes, S.M.tets.size() - first));
+  for (std::size_t first = 0; first < S.elements.size(); first += lanes) {
+    const int count = static_cast<int>(std::min<std::size_t>(lanes, S.elements.size() - first));
     Mat3 J[lanes];
     Lanes sigma, e, r;
     std::fill(sigma, sigma + lanes, 1.);
     for (int i = 0; i < count; ++i) {
-      J[i] = jacobianOf(S, first + i);
+      J[i] = jacobianOf(S, S.elements[first + i]);
       sigma[i] = det(J[i]);
     }
     regularize(sigma, delta, e, r);
     for (int i = 0; i < count; ++i) {
-      const std::array<int, 4>& tet = S.M.tets[first + i];
-      const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[first + i]];
+      const int E = S.elements[first + i];
+      const std::array<int, 4>& tet = S.M.tets[E];
+      const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
       const double eta = e[i] * norm2(J[i]), square = 1 + sigma[i] * sigma[i];
       const double volume =
           volumeWeight / 2 * (3 * e[i]) * std::sqrt(3 * e[i]);  // 1/h = (3e)^(3/2)
@@ -1754,14 +1785,10 @@ struct WorstElements {
   double lowest = 1, mean = 1, bound = 1;
 };
 
-bool isAtAny(const std::vector<unsigned char>& marked, const std::array<int, 4>& z) {
-  return marked[z[0]] || marked[z[1]] || marked[z[2]] || marked[z[3]];
-}
-
 WorstElements reachedElements(Smoother& S) {
   WorstElements worst;
-  for (std::size_t E = 0; E < S.M.tets.size(); ++E)
-    if (isAtAny(S.reached, S.M.tets[E])) worst.element.push_back(static_cast<int>(E));
+  for (int E : S.elements)
+    if (isAtAny(S.reached, S.M.tets[E])) worst.element.push_back(E);
   worst.q = qualitiesOf(S, worst.element);
   S.moved.assign(S.moved.size(), 0);
   return worst;
@@ -1949,8 +1976,9 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
               : options.threads > 0
                   ? options.threads
                   : static_cast<int>(std::max(1u, std::thread::hardware_concurrency()));
-  buildCorners(S);
   buildFreedom(S);
+  buildElements(S);
+  buildCorners(S);
   buildStars(S);
   buildSheets(S);
   S.awake = std::vector<std::atomic<unsigned char>>(M.x.size());
@@ -1962,6 +1990,7 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   if (S.report.converged && options.power > 1) liftWorst(S);
   S.report.quality = qualityStatistics(M);
   S.report.inverted = S.report.quality.inverted;
+  S.report.converged = S.report.converged && S.report.inverted == 0;
   S.report.minQ = S.report.quality.min;
   S.report.meanQ = S.report.quality.mean;
   return S.report;
@@ -1969,12 +1998,63 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
 
 // ==== Table I ===================================================================================
 
+namespace {
+
+/// Elements side by side: their edges from vertex 0, by coordinates.
+struct EdgeBlock {
+  Lanes e[9];
+
+  void set(int i, const std::array<Vec3, 4>& z) {
+    for (int k = 0; k < 3; ++k) {
+      const Vec3 edge = z[k + 1] - z[0];
+      e[3 * k][i] = edge.x, e[3 * k + 1][i] = edge.y, e[3 * k + 2][i] = edge.z;
+    }
+  }
+  Vec3 edge(int k, int i) const { return {e[3 * k][i], e[3 * k + 1][i], e[3 * k + 2][i]}; }
+};
+
+struct Jacobians {
+  Lanes N, sigma;  // ‖J‖², det J
+};
+
+/// From the edges a, b, c of E^I and p_k of E^P: J = Σ p_k g_kᵀ with the gradients g_0 = b × c/det
+/// I and so on, hence ‖J‖² = Σ_kl (p_k·p_l)(g_k·g_l).
+Jacobians jacobiansOf(const EdgeBlock& ideal, const EdgeBlock& physical) {
+  Jacobians J;
+  for (int i = 0; i < lanes; ++i) {
+    const Vec3 a = ideal.edge(0, i), b = ideal.edge(1, i), c = ideal.edge(2, i);
+    const Vec3 g0 = cross(b, c), g1 = cross(c, a), g2 = cross(a, b);  // times det I
+    const Vec3 p0 = physical.edge(0, i), p1 = physical.edge(1, i), p2 = physical.edge(2, i);
+    const double perVolume = 1 / dot(a, g0);
+    const double mixed =
+        dot(p0, p1) * dot(g0, g1) + dot(p1, p2) * dot(g1, g2) + dot(p2, p0) * dot(g2, g0);
+    J.N[i] = perVolume * perVolume *
+             (norm2(p0) * norm2(g0) + norm2(p1) * norm2(g1) + norm2(p2) * norm2(g2) + 2 * mixed);
+    J.sigma[i] = perVolume * dot(p0, cross(p1, p2));
+  }
+  return J;
+}
+
+}  // namespace
+
 std::vector<double> qualities(const Mesh& M, Ideal ideal) {
   const IdealElements ideals(M, ideal);
-  std::vector<double> q;
-  q.reserve(M.tets.size());
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
-    q.push_back(quality(jacobian(ideals.of(E), cornersOf(M.x, M.tets[E]))));
+  std::vector<double> q(M.tets.size());
+  EdgeBlock I{}, P{};
+  for (std::size_t first = 0; first < q.size(); first += lanes) {
+    const int count = static_cast<int>(std::min<std::size_t>(lanes, q.size() - first));
+    for (int i = 0; i < count; ++i) {
+      I.set(i, ideals.of(first + i));
+      P.set(i, cornersOf(M.x, M.tets[first + i]));
+    }
+    const Jacobians J = jacobiansOf(I, P);
+    const Distortions at = distortionsOf(J, 0, plainEta);
+    for (int i = 0; i < count; ++i) {
+      const std::size_t E = first + i;
+      const bool inRange = J.sigma[i] > leastH && J.sigma[i] < 1 / leastH;
+      q[E] = inRange ? 1 / at.eta[i] : quality(jacobian(ideals.of(E), cornersOf(M.x, M.tets[E])));
+    }
+  }
   return q;
 }
 

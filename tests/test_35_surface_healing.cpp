@@ -112,19 +112,21 @@ Mesh threeSquares(bool missingAbove) {
   return M;
 }
 
+using Rule = bool (*)(Bisection&, int, const std::vector<int>&);
+
 /// Applies a case to M; it must change something, keep the mesh sound and S_M's area and topology,
 /// and do nothing the second time.
-void applyCase(Mesh& M, const std::function<bool(Bisection&, int)>& rule) {
+void applyCase(Mesh& M, Rule rule) {
   const double area = shapes::computationalArea(M, 1), volume = shapes::totalVolume(M);
   const bool disk = shapes::isDisk(surfaceFaces(M, 1));
   Bisection B(M);
-  CHECK(rule(B, 1));
+  CHECK(rule(B, 1, elementsAt(M, 1)));
   CHECK(shapes::conformityFault(M) == "");
   CHECK(shapes::totalVolume(M) == doctest::Approx(volume).epsilon(1e-13));
   CHECK(shapes::computationalArea(M, 1) == doctest::Approx(area).epsilon(1e-13));
   CHECK(shapes::isDisk(surfaceFaces(M, 1)) == disk);
   const Mesh once = M;
-  CHECK_FALSE(rule(B, 1));
+  CHECK_FALSE(rule(B, 1, elementsAt(M, 1)));
   CHECK(shapes::sameMesh(M, once));
 }
 
@@ -291,8 +293,8 @@ TEST_SUITE("3.5") {
     Mesh M = cubes(3);
     label(M, {1, 1, 1}, {2, 2, 1});
     Bisection B(M);
-    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 1));
-    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 2));  // no such surface
+    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 1, elementsAt(B.M, 1)));
+    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 2, elementsAt(B.M, 2)));  // no such surface
   }
 
   TEST_CASE("case 4: a face of S_M with two edges on the rim") {
@@ -325,7 +327,7 @@ TEST_SUITE("3.5") {
     label(wide, {1, 1, 2}, {4, 4, 2});
     Bisection B(wide);
     CHECK(edgesAcrossTheRim(wide, 1) == 2);  // diagonals that cut a corner off
-    CHECK(refineEdgesAcrossTheRim(B, 1));
+    CHECK(refineEdgesAcrossTheRim(B, 1, elementsAt(B.M, 1)));
     CHECK(edgesAcrossTheRim(wide, 1) == 0);
   }
 
@@ -342,7 +344,7 @@ TEST_SUITE("3.5") {
     label(M, {2, 2, 3}, {4, 4, 3});
     Bisection none(M);
     CHECK(edgesBetweenSurfaces(M, 1) == 0);
-    CHECK_FALSE(refineEdgesBetweenSurfaces(none, 1));
+    CHECK_FALSE(refineEdgesBetweenSurfaces(none, 1, elementsAt(M, 1)));
     // surface 2, one cube above, its nodes as projection leaves them: of dimension 2 on its own
     // plane
     Parametrization plane;
@@ -396,7 +398,7 @@ TEST_SUITE("3.5") {
     CHECK(chords(M, 1) == 1);  // all of its edges are S_M's
     CHECK(isFace());
     Bisection B(M);
-    CHECK(refineToFullSubcomplex(B, 1));
+    CHECK(refineToFullSubcomplex(B, 1, elementsAt(B.M, 1)));
     CHECK_FALSE(isFace());
     CHECK(shapes::conformityFault(M) == "");
   }
@@ -419,7 +421,7 @@ TEST_SUITE("3.5") {
     label(M, {1, 1, 2}, {3, 3, 2});
     Bisection B(M);
     CHECK(chords(M, 1) == 0);
-    CHECK_FALSE(refineToFullSubcomplex(B, 1));
+    CHECK_FALSE(refineToFullSubcomplex(B, 1, elementsAt(B.M, 1)));
   }
 
   TEST_CASE(
@@ -460,7 +462,7 @@ TEST_SUITE("3.5") {
       "time") {
     const struct {
       const char* what;
-      bool (*rule)(Bisection&, int);
+      Rule rule;
       int (*count)(const Mesh&, int);
     } cases[] = {{"case 3", refineTetrahedraWithTwoFaces, tetrahedraWithTwoFaces},
                  {"case 4", refineFacesWithTwoRimEdges, facesWithTwoRimEdges},
@@ -478,9 +480,9 @@ TEST_SUITE("3.5") {
           Mesh M = I.M;
           Bisection B(M);
           const bool found = c.count(M, 1) > 0;
-          CHECK(c.rule(B, 1) == found);
+          CHECK(c.rule(B, 1, elementsAt(M, 1)) == found);
           CHECK(c.count(M, 1) == 0);
-          CHECK_FALSE(c.rule(B, 1));
+          CHECK_FALSE(c.rule(B, 1, elementsAt(M, 1)));
         }
       }
   }
