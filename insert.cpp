@@ -328,32 +328,41 @@ const Parametrization& surfaceOf(const Mesh& M, int label) {
   return label > 0 ? M.surfaces[label - 1] : M.patches[-label - 1];
 }
 
-std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k) {
+namespace {
+
+/// The faces for which wanted(label, nodes) holds; one of an inserted surface, which is seen from
+/// both of its tetrahedra, once. Outward for a positively oriented tetrahedron.
+template <class Wanted>
+std::vector<std::array<int, 3>> labelledFaces(const Mesh& M, Wanted wanted) {
+  constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
   std::vector<std::array<int, 3>> faces;
+  std::vector<std::pair<std::array<int, 3>, std::size_t>> inserted;  // sorted nodes, place in faces
   for (std::size_t E = 0; E < M.faceLabel.size(); ++E)
     for (int i = 0; i < 4; ++i) {
-      if (M.faceLabel[E][i] != k) continue;
+      const int label = M.faceLabel[E][i];
+      if (label == 0) continue;
       const std::array<int, 4>& z = M.tets[E];
-      // outward for a positively oriented tetrahedron
-      constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
-      faces.push_back({z[outward[i][0]], z[outward[i][1]], z[outward[i][2]]});
+      std::array<int, 3> face{z[outward[i][0]], z[outward[i][1]], z[outward[i][2]]};
+      if (!wanted(label, face)) continue;
+      faces.push_back(face);
+      std::sort(face.begin(), face.end());
+      if (label > 0) inserted.push_back({face, faces.size() - 1});
     }
-  if (k < 0) return faces;
-  // An inserted face is seen from both of its tetrahedra: keep the first of each pair.
-  std::vector<std::pair<std::array<int, 3>, int>> sorted;
-  for (std::size_t i = 0; i < faces.size(); ++i) {
-    std::array<int, 3> key = faces[i];
-    std::sort(key.begin(), key.end());
-    sorted.push_back({key, static_cast<int>(i)});
-  }
-  std::sort(sorted.begin(), sorted.end());
-  std::vector<int> keep;
-  for (std::size_t i = 0; i < sorted.size(); ++i)
-    if (i == 0 || sorted[i].first != sorted[i - 1].first) keep.push_back(sorted[i].second);
-  std::sort(keep.begin(), keep.end());
-  std::vector<std::array<int, 3>> once;
-  for (int i : keep) once.push_back(faces[i]);
-  return once;
+  std::sort(inserted.begin(), inserted.end());
+  std::vector<char> isSecond(faces.size(), 0);
+  for (std::size_t i = 1; i < inserted.size(); ++i)
+    isSecond[inserted[i].second] = inserted[i].first == inserted[i - 1].first;
+  std::size_t kept = 0;
+  for (std::size_t i = 0; i < faces.size(); ++i)
+    if (!isSecond[i]) faces[kept++] = faces[i];
+  faces.resize(kept);
+  return faces;
+}
+
+}  // namespace
+
+std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k) {
+  return labelledFaces(M, [k](int label, const auto&) { return label == k; });
 }
 
 // ==== 2. Meccano: the box ========================================================================
@@ -4382,35 +4391,34 @@ bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
 
 enum class Cut : char { unknown, yes, no };
 
-/// Tells of each tetrahedron not yet known whether S cuts it.
-void classify(const Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut) {
-  cut.resize(B.M.tets.size(), Cut::unknown);
-  for (std::size_t E = 0; E < cut.size(); ++E)
-    if (cut[E] == Cut::unknown)
-      cut[E] = meetsSurface(B.M, static_cast<int>(E), S) ? Cut::yes : Cut::no;
-}
-
 /// Refines the tetrahedra cut by S that `wanted` asks for until there is none.
 template <class Wanted>
 void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wanted wanted) {
   constexpr int maxPasses = 250;  // one level a pass; levels fit in a byte
+  std::vector<int> changed(B.M.tets.size());
+  std::iota(changed.begin(), changed.end(), 0);
   for (int pass = 0; pass < maxPasses; ++pass) {
-    classify(B, S, cut);
+    cut.resize(B.M.tets.size(), Cut::unknown);
     std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
-    for (std::size_t E = 0; E < cut.size(); ++E)
-      if (cut[E] == Cut::yes && wanted(static_cast<int>(E)))
-        refine.push_back({static_cast<int>(E), B.M.level[E]});
+    for (int E : changed) {
+      if (cut[E] == Cut::unknown) cut[E] = meetsSurface(B.M, E, S) ? Cut::yes : Cut::no;
+      if (cut[E] == Cut::yes && wanted(E)) refine.push_back({E, B.M.level[E]});
+    }
     if (refine.empty()) return;
     B.splits.clear();
     for (const auto& [E, level] : refine)
       if (B.M.level[E] == level) B.bisect(E);
     cut.resize(B.M.tets.size(), Cut::unknown);
+    changed.clear();
     // what is not cut has no parts that are, but where a midpoint was moved onto a surface
     for (const Bisection::Split& split : B.splits) {
       const bool isPart = B.M.dimension[split.midpoint] == 3;
       const Cut part = isPart && cut[split.parent] == Cut::no ? Cut::no : Cut::unknown;
       cut[split.parent] = cut[split.child] = part;
+      changed.push_back(split.parent), changed.push_back(split.child);
     }
+    std::sort(changed.begin(), changed.end());
+    changed.erase(std::unique(changed.begin(), changed.end()), changed.end());
   }
 }
 
@@ -4428,11 +4436,7 @@ namespace {
 
 /// The faces of ∂𝓜, of all patches.
 std::vector<std::array<int, 3>> patchFaces(const Mesh& M) {
-  std::vector<std::array<int, 3>> faces;
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
-    for (int i = 0; i < 4; ++i)
-      if (M.faceLabel[E][i] < 0) faces.push_back(faceOpposite(M.tets[E], i));
-  return faces;
+  return labelledFaces(M, [](int label, const auto&) { return label < 0; });
 }
 
 double areaOf(const TriangleSurface& S) {
@@ -4914,9 +4918,9 @@ Approximation middleApproximation(Bisection& B, const Approximation& A, const Su
   middle.below = cubes.below;
   middle.T.assign(B.M.tets.size(), 0);
   for (std::size_t E = 0; E < middle.T.size(); ++E) {
+    if (B.M.level[E] < A.level) continue;
     const std::uint64_t cube = Lattice(A.level).cubeOf(B.M, static_cast<int>(E));
-    middle.T[E] = B.M.level[E] >= A.level &&
-                  std::binary_search(cubes.touching.begin(), cubes.touching.end(), cube);
+    middle.T[E] = std::binary_search(cubes.touching.begin(), cubes.touching.end(), cube);
   }
   return middle;
 }
@@ -5068,12 +5072,9 @@ std::vector<std::array<int, 3>> facesAround(const Mesh& M, const SurfaceDistance
                                             double margin) {
   const Vec3 wide = margin * Vec3{1, 1, 1};
   const Vec3 lo = S.tree.nodes[0].box.lo - wide, hi = S.tree.nodes[0].box.hi + wide;
-  std::vector<std::array<int, 3>> faces;
-  for (std::size_t k = 1; k <= M.surfaces.size(); ++k)
-    for (const auto& face : surfaceFaces(M, static_cast<int>(k)))
-      if (boxesMeet(boxOf({M.x[face[0]], M.x[face[1]], M.x[face[2]]}), lo, hi))
-        faces.push_back(face);
-  return faces;
+  return labelledFaces(M, [&](int label, const std::array<int, 3>& v) {
+    return label > 0 && boxesMeet(boxOf({M.x[v[0]], M.x[v[1]], M.x[v[2]]}), lo, hi);
+  });
 }
 
 /// Whether the segment pq crosses a triangle of the tree.

@@ -2035,14 +2035,14 @@ Jacobians jacobiansOf(const EdgeBlock& ideal, const EdgeBlock& physical) {
   return J;
 }
 
-}  // namespace
-
-std::vector<double> qualities(const Mesh& M, Ideal ideal) {
+/// use(q) for each element of the mesh, in order. [eq. (7)]
+template <class Use>
+void forQualities(const Mesh& M, Ideal ideal, const Use& use) {
   const IdealElements ideals(M, ideal);
-  std::vector<double> q(M.tets.size());
+  const int tets = static_cast<int>(M.tets.size());
   EdgeBlock I{}, P{};
-  for (std::size_t first = 0; first < q.size(); first += lanes) {
-    const int count = static_cast<int>(std::min<std::size_t>(lanes, q.size() - first));
+  for (int first = 0; first < tets; first += lanes) {
+    const int count = std::min(lanes, tets - first);
     for (int i = 0; i < count; ++i) {
       I.set(i, ideals.of(first + i));
       P.set(i, cornersOf(M.x, M.tets[first + i]));
@@ -2050,32 +2050,41 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal) {
     const Jacobians J = jacobiansOf(I, P);
     const Distortions at = distortionsOf(J, 0, plainEta);
     for (int i = 0; i < count; ++i) {
-      const std::size_t E = first + i;
+      const int E = first + i;
       const bool inRange = J.sigma[i] > leastH && J.sigma[i] < 1 / leastH;
-      q[E] = inRange ? 1 / at.eta[i] : quality(jacobian(ideals.of(E), cornersOf(M.x, M.tets[E])));
+      use(inRange ? 1 / at.eta[i] : quality(jacobian(ideals.of(E), cornersOf(M.x, M.tets[E]))));
     }
   }
+}
+
+}  // namespace
+
+std::vector<double> qualities(const Mesh& M, Ideal ideal) {
+  std::vector<double> q;
+  q.reserve(M.tets.size());
+  forQualities(M, ideal, [&q](double value) { q.push_back(value); });
   return q;
 }
 
 QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal) {
   QualityStatistics table;
-  const std::vector<double> q = qualities(M, ideal);
-  table.tetrahedra = static_cast<int>(q.size());
-  if (q.empty()) return table;
+  table.tetrahedra = static_cast<int>(M.tets.size());
+  if (M.tets.empty()) return table;
   const int last = static_cast<int>(table.histogram.size()) - 1;
-  table.min = table.max = q[0];
-  for (double value : q) {
-    if (value == 0) ++table.inverted;
-    table.min = std::min(table.min, value);
-    table.max = std::max(table.max, value);
-    table.mean += value;
-    ++table.histogram[std::clamp(static_cast<int>(20 * value), 0, last)];
-  }
-  const double count = static_cast<double>(q.size());
+  double squares = 0;
+  table.min = 1;
+  forQualities(M, ideal, [&](double q) {
+    if (q == 0) ++table.inverted;
+    table.min = std::min(table.min, q);
+    table.max = std::max(table.max, q);
+    table.mean += q;
+    squares += (1 - q) * (1 - q);
+    ++table.histogram[std::clamp(static_cast<int>(20 * q), 0, last)];
+  });
+  const double count = static_cast<double>(M.tets.size());
   table.mean /= count;
-  for (double value : q) table.stdDev += (value - table.mean) * (value - table.mean);
-  table.stdDev = std::sqrt(table.stdDev / count);
+  const double fromMean = squares / count - (1 - table.mean) * (1 - table.mean);
+  table.stdDev = std::sqrt(std::max(0., fromMean));
   return table;
 }
 
