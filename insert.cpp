@@ -2379,6 +2379,7 @@ int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
 
 void Bisection::bisectRing(const std::vector<int>& around) {
   const int a = M.tets[around[0]][0], b = M.tets[around[0]][1];
+  for (int t : around) keepForUndo(t);
   const int m = addMidpoint(a, b, around), first = static_cast<int>(M.tets.size());
   // The child of ring tetrahedron t at end node `end`: child 0 keeps the index, child 1 is
   // appended.
@@ -2409,7 +2410,10 @@ void Bisection::bisectRing(const std::vector<int>& around) {
   for (std::size_t i = 0; i < around.size(); ++i) {
     const int t = around[i], t1 = first + static_cast<int>(i),
               beyond = halves[2 * i + 1].neighbour[3];
-    if (beyond >= 0) *std::find(neighbour[beyond].begin(), neighbour[beyond].end(), t) = t1;
+    if (beyond >= 0) {
+      keepForUndo(beyond);
+      *std::find(neighbour[beyond].begin(), neighbour[beyond].end(), t) = t1;
+    }
     tetOf[M.tets[t][1]] = t1;
     M.type[t] = static_cast<unsigned char>((M.type[t] + 1) % 3);
     ++M.level[t];
@@ -2426,6 +2430,29 @@ void Bisection::bisectRing(const std::vector<int>& around) {
     neighbour[t] = halves[2 * i].neighbour;
     M.faceLabel[t] = halves[2 * i].label;
   }
+}
+
+void Bisection::keepForUndo(int E) {
+  if (undoTets < 0) return;
+  before.push_back({E, M.tets[E], neighbour[E], M.faceLabel[E], M.type[E], M.level[E]});
+}
+
+void Bisection::beginTrial() { undoNodes = M.x.size(), undoTets = static_cast<int>(M.tets.size()); }
+
+void Bisection::undoTrial() {
+  M.x.resize(undoNodes), M.xi.resize(undoNodes), M.parameter.resize(undoNodes);
+  M.dimension.resize(undoNodes), M.entity.resize(undoNodes), tetOf.resize(undoNodes);
+  for (auto b = before.rbegin(); b != before.rend(); ++b) {
+    M.tets[b->E] = b->tet, neighbour[b->E] = b->neighbour, M.faceLabel[b->E] = b->label;
+    M.type[b->E] = b->type, M.level[b->E] = b->level;
+    if (b->E < undoTets)
+      for (int n : b->tet)
+        if (n < static_cast<int>(undoNodes)) tetOf[n] = b->E;
+  }
+  M.tets.resize(undoTets), neighbour.resize(undoTets), M.faceLabel.resize(undoTets);
+  M.type.resize(undoTets), M.level.resize(undoTets);
+  before.clear(), splits.clear();
+  undoTets = -1;
 }
 
 void Bisection::bisect(int E, int depth) {
@@ -4434,6 +4461,11 @@ int cubeLevel(const Mesh& M, double lc) {
 
 namespace {
 
+/// Physical edge of the cubes of a level.
+double cubeEdge(const Mesh& M, int level) {
+  return std::ldexp(std::cbrt(M.cube.x * M.cube.y * M.cube.z), -level / 3);
+}
+
 /// The faces of ∂𝓜, of all patches.
 std::vector<std::array<int, 3>> patchFaces(const Mesh& M) {
   return labelledFaces(M, [](int label, const auto&) { return label < 0; });
@@ -4800,7 +4832,7 @@ CubeGraph graphOf(const Mesh& M, const Approximation& layer, const Cubes& cubes,
                   const SurfaceDistance& S, double perDistance) {
   constexpr CubeGraph::Weight perSquare = 1000, firm = 1000000 * perSquare;
   const Lattice lattice(layer.level);
-  const double perH = lattice.scale / std::cbrt(M.cube.x * M.cube.y * M.cube.z);
+  const double perH = 1 / cubeEdge(M, layer.level);
   CubeGraph G;
   for (std::size_t c = 0; c < cubes.keys.size(); ++c) {
     const SurfaceQuery at = S.query(cubes.centres[c]);
@@ -4869,22 +4901,21 @@ void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
 struct DividedCubes {
   std::vector<std::uint64_t> above, below, touching;  // sorted; of those below the touching ones
 };                                                    // touch one above
-DividedCubes divideCubes(const Bisection& start, const Approximation& A, const SurfaceDistance& S,
+DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDistance& S,
                          double perDistance) {
-  const Mesh& M = start.M;
-  Mesh refined = M;
-  Bisection B(refined, start.neighbour);
-  Approximation layer = A;
   const Lattice lattice(A.level);
-  std::vector<char> seen(M.x.size(), 0);
+  std::vector<char> seen(B.M.x.size(), 0);
+  std::vector<int> nodes;
   for (int E : elementsOf(A.T))
-    for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n]) && !seen[n] && !isOnBoundary(M, n)) {
-        seen[n] = 1;
-        addElementsAt(B, layer, n);
-      }
-  const Cubes cubes(refined, layer);
-  const std::vector<char> isAbove = minimumCut(graphOf(refined, layer, cubes, S, perDistance));
+    for (int n : B.M.tets[E])
+      if (lattice.isNode(B.M.xi[n]) && !seen[n] && !isOnBoundary(B.M, n))
+        seen[n] = 1, nodes.push_back(n);
+  Approximation layer = A;
+  B.beginTrial();
+  for (int n : nodes) addElementsAt(B, layer, n);
+  const Cubes cubes(B.M, layer);
+  const std::vector<char> isAbove = minimumCut(graphOf(B.M, layer, cubes, S, perDistance));
+  B.undoTrial();
   DividedCubes divided;
   KeyMap cornersAbove;
   for (std::size_t c = 0; c < isAbove.size(); ++c) {
@@ -5028,10 +5059,9 @@ void collectNodes(SquareSurface& Q, int meshNodes) {
 }  // namespace
 
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
-  const Lattice lattice(A.level);
   SquareSurface Q;
   Q.level = A.level, Q.isMiddle = A.isMiddle;
-  Q.h = std::cbrt(M.cube.x * M.cube.y * M.cube.z) / lattice.scale;
+  Q.h = cubeEdge(M, A.level);
   addSquares(M, A, nodesOf(M, A), Q);
   joinSquares(Q);
   findDiagonals(M, A, Q);
@@ -6681,8 +6711,7 @@ void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
 void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) {
   constexpr int maxLevel = 57;  // 2^19 cubes along a unit of ξ: what a lattice key holds
   const int level = cubeLevel(M, lc);
-  const double halving = std::exp2(-level / 3);
-  const double h = halving * std::cbrt(M.cube.x * M.cube.y * M.cube.z);
+  const double h = cubeEdge(M, level);
   double farthest = 0, extent = 0;
   for (const Vec3& p : S.S.points) extent = std::max(extent, norm(p - S.S.points[S.rim[0]]));
   for (const Vec3& xi : M.xi) farthest = std::max({farthest, xi.x, xi.y, xi.z});
@@ -6695,7 +6724,7 @@ void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) 
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " asks for about " +
                      number(predicted) + " tetrahedra, above the limit of " +
                      std::to_string(maxTets) + "; raise l_c or the limit");
-  if (level > maxLevel || farthest / halving > std::exp2(maxLevel / 3))
+  if (level > maxLevel || farthest > std::exp2((maxLevel - level) / 3))
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) +
                      " is below 1/500000 of the domain; raise l_c");
 }
@@ -6784,18 +6813,25 @@ std::string leftOut(const Insertion& I, const Selection& selected) {
 /// .004 in the lowest q): one is enough.
 constexpr double mirrored = .01;
 
-/// Gives back what the vectors of a refined mesh, which have grown by doubling, do not use: as much
-/// again as the mesh.
-void trim(Mesh& M) {
-  M.x.shrink_to_fit(), M.xi.shrink_to_fit(), M.parameter.shrink_to_fit();
-  M.dimension.shrink_to_fit(), M.entity.shrink_to_fit();
-  M.tets.shrink_to_fit(), M.faceLabel.shrink_to_fit();
-  M.type.shrink_to_fit(), M.level.shrink_to_fit();
-}
-
-void trim(Layer& layer) {
-  trim(layer.M);
-  layer.neighbour.shrink_to_fit();
+/// A copy with room to grow: vectors that double are copied again and again.
+Mesh roomyCopy(const Mesh& M, double tets) {
+  constexpr double nodesPerTet = .22;  // of fine meshes
+  const std::size_t more = static_cast<std::size_t>(tets);
+  const std::size_t moreNodes = static_cast<std::size_t>(nodesPerTet * tets);
+  Mesh copy;
+  const auto grow = [](auto& to, const auto& from, std::size_t by) {
+    to.reserve(from.size() + by);
+    to = from;
+  };
+  grow(copy.x, M.x, moreNodes), grow(copy.xi, M.xi, moreNodes);
+  grow(copy.dimension, M.dimension, moreNodes), grow(copy.entity, M.entity, moreNodes);
+  grow(copy.parameter, M.parameter, moreNodes);
+  grow(copy.tets, M.tets, more), grow(copy.faceLabel, M.faceLabel, more);
+  grow(copy.type, M.type, more), grow(copy.level, M.level, more);
+  copy.cube = M.cube;
+  copy.patches = M.patches, copy.surfaces = M.surfaces;
+  copy.curves = M.curves, copy.corners = M.corners;
+  return copy;
 }
 
 /// S must not cross the faces of earlier surfaces, which deviate from these: refined with T they
@@ -6813,7 +6849,9 @@ void checkFacesApart(Insertion& I) {
 void refineLayer(Insertion& I, bool isAgain) {
   constexpr double cheapest = 1.5, centres = 1000;  // [choice] of middleApproximation()
   Layer& layer = I.layer;
-  layer.M = I.original, layer.A = {};
+  layer.A = {};
+  const double h = cubeEdge(I.original, cubeLevel(I.original, layer.lc));
+  layer.M = roomyCopy(I.original, predictedTets(areaOf(I.S.S), h));
   Bisection B(layer.M);
   layer.A = volumetricApproximation(B, I.S, layer.lc);
   if (!isAgain) I.stage("approximated", layer.M);
@@ -6826,7 +6864,6 @@ void refineLayer(Insertion& I, bool isAgain) {
   }
   layer.neighbour = std::move(B.neighbour);
   layer.tets = layer.M.tets.size();
-  trim(layer);
 }
 
 /// The same again where the mesh was taken.
@@ -6980,9 +7017,7 @@ int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {
   labelSurface(B, layer.Q, layer.A, way.extraction.selected, I.k);
   ++I.ways;
   I.stage("extracted", M);
-  const int rounds = surfaceHealing(B, I.k);
-  trim(M);
-  return rounds;
+  return surfaceHealing(B, I.k);
 }
 
 /// §3.4's labels, 3.5, 3.6 and 3.7 on the refined mesh, which becomes M.

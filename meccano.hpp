@@ -218,8 +218,9 @@ struct OptimizeOptions {
   int threads = 1;
   // [§3.7.4 departure] sweeps that Anderson's acceleration mixes; [0, 8], 0: none
   int acceleration = 4;
-  std::vector<int> fixed = {};   // nodes that stay where they are, besides the corners
-  std::vector<int> active = {};  // nodes visited in the first sweep; empty: all
+  std::vector<int> fixed = {};  // nodes that stay where they are, besides the corners
+  // nodes visited in the first sweep: only these and nodes near them move; empty: all
+  std::vector<int> active = {};
   // [§2 choice] δ from each star's own σ, for meshes whose σ spans orders of magnitude
   bool starDelta = false;
   // asked before a sliding node n moves to x at this parameter; false: it stays. Only reads M.
@@ -405,6 +406,10 @@ struct Bisection {
   void ring(int E, int a, int b, std::vector<int>& around) const;
   void star(int n, std::vector<int>& around) const;
   int tetWithEdge(int a, int b) const;
+  /// undoTrial() takes the bisections since beginTrial() back: the mesh and its adjacency are as
+  /// they were; the log is empty.
+  void beginTrial();
+  void undoTrial();
 
   /// Dimension and number (as in Mesh::entity) of what the edge (a, b) lies on.
   struct EdgeEntity {
@@ -413,7 +418,17 @@ struct Bisection {
   EdgeEntity entityOf(int a, int b, const std::vector<int>& around) const;
 
  private:
+  struct Before {
+    int E;
+    std::array<int, 4> tet, neighbour, label;
+    unsigned char type, level;
+  };
+  std::vector<Before> before;  // what has changed since beginTrial(), oldest first
+  std::size_t undoNodes = 0;
+  int undoTets = -1;  // -1: no trial
+
   int addMidpoint(int a, int b, const std::vector<int>& around);
+  void keepForUndo(int E);
   void bisectRing(const std::vector<int>& around);
 };
 

@@ -32,6 +32,10 @@ std::vector<int> allOf(const Mesh& M) {
   return E;
 }
 
+bool has(const std::array<int, 4>& tet, std::size_t n) {
+  return std::count(tet.begin(), tet.end(), static_cast<int>(n)) == 1;
+}
+
 /// Hundreds of refinements of one tetrahedron each, half of them near one point.
 Mesh locallyRefined(Mesh M, std::uint64_t seed, int times) {
   Dice dice(seed);
@@ -392,10 +396,7 @@ TEST_SUITE("2") {
     for (int i = 0; i < 200; ++i) bisection.bisect(dice.below(M.tets.size()));
     CHECK(bisection.neighbour == faceNeighbours(M));
     CHECK(bisection.splits.size() == M.tets.size() - 12);
-    for (std::size_t n = 0; n < M.x.size(); ++n) {
-      const auto& z = M.tets[bisection.tetOf[n]];
-      CHECK(std::count(z.begin(), z.end(), static_cast<int>(n)) == 1);
-    }
+    for (std::size_t n = 0; n < M.x.size(); ++n) CHECK(has(M.tets[bisection.tetOf[n]], n));
     for (int n : {0, 5, 40}) {
       std::vector<int> around;
       bisection.star(n, around);
@@ -404,6 +405,26 @@ TEST_SUITE("2") {
         if (std::count(M.tets[E].begin(), M.tets[E].end(), n)) expected.insert(static_cast<int>(E));
       CHECK(std::set<int>(around.begin(), around.end()) == expected);
     }
+  }
+
+  TEST_CASE("bisection: a trial is taken back to the same mesh and adjacency") {
+    Mesh M = locallyRefined(boxMesh({0, 0, 0}, {1, 2, 1}, {1, 2, 1}), 7, 100);
+    Bisection bisection(M);
+    const Mesh before = M;
+    const std::vector<std::array<int, 4>> neighbour = bisection.neighbour;
+    Dice dice(19);
+    for (int trial = 0; trial < 3; ++trial) {
+      bisection.beginTrial();
+      for (int i = 0; i < 100; ++i) bisection.bisect(dice.below(M.tets.size()));
+      CHECK(M.tets.size() > before.tets.size() + 100);
+      bisection.undoTrial();
+      CHECK(shapes::sameMesh(M, before));
+      CHECK(bisection.neighbour == neighbour);
+      CHECK(bisection.tetOf.size() == M.x.size());
+      for (std::size_t n = 0; n < M.x.size(); ++n) CHECK(has(M.tets[bisection.tetOf[n]], n));
+    }
+    for (int i = 0; i < 50; ++i) bisection.bisect(dice.below(M.tets.size()));
+    CHECK(bisection.neighbour == faceNeighbours(M));
   }
 
   TEST_CASE("bisection: bisectEdge splits the edge asked for and no other way than by closure") {

@@ -322,6 +322,33 @@ TEST_SUITE("3.7.4") {
     CHECK(norm(M.x[moved] - Vec3{.5, .5, .5}) < 1e-3);
   }
 
+  TEST_CASE("Algorithm 2: choice, nodes farther than four edges from the active ones stay") {
+    Mesh M = shakenCube(12, .2);
+    const Mesh before = M;
+    int middle = -1;
+    for (std::size_t n = 0; n < M.x.size(); ++n)
+      if (norm(M.xi[n] - Vec3{6, 6, 6}) < 1e-9) middle = static_cast<int>(n);
+    REQUIRE(middle >= 0);
+    OptimizeOptions options;
+    options.active = {middle};
+    CHECK(optimizeMesh(M, options).converged);
+    int far = 0, near = 0;
+    for (std::size_t n = 0; n < M.x.size(); ++n) {
+      const Vec3 d = M.xi[n] - M.xi[middle];  // an edge changes each coordinate by at most 1
+      const bool isFar = std::max({std::abs(d.x), std::abs(d.y), std::abs(d.z)}) > 4.5;
+      far += isFar;
+      near += !(M.x[n] == before.x[n]);
+      if (isFar) CHECK(M.x[n] == before.x[n]);
+    }
+    CHECK(far > 100);
+    CHECK(near > 100);
+    M.x[0] = {.5, .5, .5};  // a corner of the cube: its elements are out of reach, and inverted
+    const OptimizeReport report = optimizeMesh(M, options);
+    CHECK(report.inverted == qualityStatistics(M).inverted);
+    CHECK(report.inverted > 0);
+    CHECK_FALSE(report.converged);
+  }
+
   TEST_CASE("Algorithm 2: two runs give the same bytes") {
     std::vector<int> block;
     Mesh A = turnedCube(8, 3, 5, 2.2, block), B = A;

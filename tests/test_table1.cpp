@@ -46,6 +46,28 @@ TEST_SUITE("Table I") {
     CHECK(table.min == 0);
   }
 
+  TEST_CASE("Table I: departure, q of many elements at once is eq. (7) of eq. (6)") {
+    Mesh M = boxMesh({0, 0, 0}, {1, 2, 1}, {2, 4, 2});
+    for (std::size_t n = 0; n < M.x.size(); ++n)
+      M.x[n] += .3 * Vec3{std::sin(7. * double(n)), std::sin(5. * double(n)), std::cos(double(n))};
+    for (double scale : {1., 1e-45, 1e45}) {  // the last two: σ beyond what the fast form takes
+      Mesh scaled = M;
+      for (Vec3& p : scaled.x) p = scale * p;
+      const std::vector<double> q = qualities(scaled);
+      int inverted = 0;
+      for (std::size_t E = 0; E < q.size(); ++E) {
+        std::array<Vec3, 4> ideal, physical;
+        for (int i = 0; i < 4; ++i)
+          ideal[i] = M.xi[M.tets[E][i]], physical[i] = scaled.x[M.tets[E][i]];
+        const double literal = quality(jacobian(ideal, physical));
+        CHECK(q[E] == doctest::Approx(literal).epsilon(1e-13));
+        inverted += literal == 0;
+      }
+      CHECK(inverted > 0);
+      CHECK(inverted < static_cast<int>(q.size()));
+    }
+  }
+
   TEST_CASE("Table I: min, max, mean, standard deviation, histogram") {
     Mesh M = shapes::unsymmetricStar();
     const std::vector<double> q = qualities(M);
