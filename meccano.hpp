@@ -231,7 +231,8 @@ struct OptimizeOptions {
 };
 
 struct OptimizeReport {
-  int sweeps = 0;   // of all phases
+  int sweeps = 0;   // of all phases; a sweep visits the nodes whose stars have moved
+  long visits = 0;  // of nodes, in all sweeps
   double disp = 0;  // of Algorithm 2's last sweep (before the worst elements), as maxDisp
   // valid and disp <= maxDisp (where the worst elements are lifted next: its root mean square <= 2
   // maxDisp) before maxSweeps

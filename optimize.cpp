@@ -12,6 +12,7 @@
 // Hessian (a cube root each), one more for the trial step.
 #include <atomic>
 #include <cfloat>
+#include <condition_variable>
 #include <cstddef>
 #include <cstdio>
 #include <cstring>
@@ -591,10 +592,85 @@ WolfeStep strongWolfe(const std::function<LinePoint(double t)>& F, double tFirst
 
 namespace {
 
-/// task(k, from, to) for the pieces k of [begin, end), which threads take in turn: whatever the
+/// Threads that share one job after the other. They wait in between, for to start a thread takes
+/// longer than to visit the nodes of most colours.
+class Crew {
+ public:
+  Crew() = default;
+  Crew(const Crew&) = delete;
+  Crew& operator=(const Crew&) = delete;
+  ~Crew();
+  /// Of so many threads, the caller's among them.
+  void hire(int threads);
+  /// job() here and in those of the others that come before it ends here.
+  void run(const std::function<void()>& job);
+
+ private:
+  void serve();
+
+  std::vector<std::thread> others_;
+  std::mutex mutex_;
+  std::condition_variable start_, end_;
+  const std::function<void()>* job_ = nullptr;  // null: none; guarded by mutex_, as what follows
+  int inside_ = 0;                              // others at the job
+  bool leaves_ = false;
+  std::atomic<unsigned> round_{0};  // of jobs
+};
+
+Crew::~Crew() {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    leaves_ = true;
+    ++round_;
+  }
+  start_.notify_all();
+  for (std::thread& other : others_) other.join();
+}
+
+void Crew::hire(int threads) {
+  try {
+    for (int k = 1; k < threads; ++k) others_.emplace_back([this] { serve(); });
+  } catch (const std::system_error&) {
+    // no more threads to be had: those there are do it all
+  }
+}
+
+void Crew::serve() {
+  constexpr int patience = 200;  // looks for a job before it sleeps: some 100 μs
+  unsigned seen = 0;
+  for (;;) {
+    for (int k = 0; k < patience && round_ == seen; ++k) std::this_thread::yield();
+    std::unique_lock<std::mutex> lock(mutex_);
+    start_.wait(lock, [&] { return round_ != seen; });
+    seen = round_;
+    if (leaves_) return;
+    if (job_ == nullptr) continue;
+    const std::function<void()>& job = *job_;
+    ++inside_;
+    lock.unlock();
+    job();
+    lock.lock();
+    if (--inside_ == 0) end_.notify_one();
+  }
+}
+
+void Crew::run(const std::function<void()>& job) {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    job_ = &job;
+    ++round_;
+  }
+  start_.notify_all();
+  job();
+  std::unique_lock<std::mutex> lock(mutex_);
+  job_ = nullptr;
+  end_.wait(lock, [this] { return inside_ == 0; });
+}
+
+/// task(k, from, to) for the pieces k of [begin, end), which the crew takes in turn: whatever the
 /// tasks do may not depend on who does it and when. An exception ends all and is thrown again here.
 template <class Task>
-void forPieces(int threads, int begin, int end, int size, const Task& task) {
+void forPieces(Crew& crew, int begin, int end, int size, const Task& task) {
   const int pieces = (end - begin + size - 1) / size;
   std::atomic<int> next{0};
   std::mutex mutex;
@@ -609,22 +685,18 @@ void forPieces(int threads, int begin, int end, int size, const Task& task) {
       failure = std::current_exception();
     }
   };
-  std::vector<std::thread> others;
-  try {
-    for (int k = 1; k < std::min(threads, pieces); ++k) others.emplace_back(work);
-  } catch (const std::system_error&) {
-    // no more threads to be had: those there are do it all
-  }
-  work();
-  for (std::thread& other : others) other.join();
+  if (pieces > 1)
+    crew.run(work);
+  else
+    work();
   if (failure) std::rethrow_exception(failure);
 }
 
 /// The sum of task(from, to) over the pieces, in their order.
 template <class Sum, class Task>
-Sum sumOfPieces(int threads, int begin, int end, int size, const Task& task) {
+Sum sumOfPieces(Crew& crew, int begin, int end, int size, const Task& task) {
   std::vector<Sum> parts((end - begin + size - 1) / size);
-  forPieces(threads, begin, end, size, [&](int k, int from, int to) { parts[k] = task(from, to); });
+  forPieces(crew, begin, end, size, [&](int k, int from, int to) { parts[k] = task(from, to); });
   Sum sum{};
   for (const Sum& part : parts) sum += part;
   return sum;
@@ -645,7 +717,7 @@ struct Smoother {
   Mesh& M;
   const OptimizeOptions& options;
   OptimizeReport report = {};
-  int threads = 1;
+  mutable Crew crew = {};
 
   std::vector<int> elements = {};         // those that may change, ascending
   std::vector<IdealCorner> corners = {};  // 4 for each ideal element; few on a meccano mesh
@@ -1015,7 +1087,7 @@ Validity validity(const Smoother& S) {
     }
     return v;
   };
-  return sumOfPieces<Validity>(S.threads, 0, static_cast<int>(S.elements.size()), piece, ofPiece);
+  return sumOfPieces<Validity>(S.crew, 0, static_cast<int>(S.elements.size()), piece, ofPiece);
 }
 
 /// q of these elements, from the closed form at their first vertex.
@@ -1033,7 +1105,7 @@ std::vector<double> qualitiesOf(const Smoother& S, const std::vector<int>& eleme
       for (int i = 0; i < std::min(lanes, to - k); ++i) q[k + i] = 1 / at.eta[i];
     }
   };
-  forPieces(S.threads, 0, static_cast<int>(q.size()), piece, ofPiece);
+  forPieces(S.crew, 0, static_cast<int>(q.size()), piece, ofPiece);
   return q;
 }
 
@@ -1275,34 +1347,39 @@ void wakeNeighbours(Smoother& S, int row) {
     for (int i : {S.star[k].a, S.star[k].b, S.star[k].c}) wakeNode(S, i);
 }
 
-/// Visits the awake nodes among some rows of one colour. Returns the largest displacement.
-double visitRows(Smoother& S, int begin, int end) {
+/// Visits nodes of one colour, given by their rows. Returns the largest displacement.
+double visitRows(Smoother& S, const int* rows, int count) {
   Visit visit;
   double disp = 0;
-  for (int row = begin; row < end; ++row) {
-    std::atomic<unsigned char>& awake = S.awake[S.order[row]];
-    if (!awake.load(std::memory_order_relaxed)) continue;
+  for (int k = 0; k < count; ++k) {
+    const int row = rows[k], n = S.order[row];
     const double moved = smoothNode(S, row, visit);
     disp = std::max(disp, moved);
-    S.moved[S.order[row]] |= moved > 0;
-    awake.store(moved > S.wake, std::memory_order_relaxed);
+    S.moved[n] |= moved > 0;
+    S.awake[n].store(moved > S.wake, std::memory_order_relaxed);
     if (moved <= S.wake) continue;
     wakeNeighbours(S, row);
-    if (S.penalty.scale == 0) S.reached[S.order[row]] = 1;
+    if (S.penalty.scale == 0) S.reached[n] = 1;
   }
   return disp;
 }
 
-constexpr int rowsPerTask = 128;  // some 100 μs
+constexpr int rowsPerTask = 64;  // some 70 μs
 
 /// [§3.7.4, Algorithm 2] The body of its while loop over the nodes whose star has moved: returns
 /// disp.
 double sweepNodes(Smoother& S) {
   std::vector<double> moved(S.order.size() / rowsPerTask + 1, 0);  // of the k-th piece of a colour
-  for (std::size_t c = 0; c + 1 < S.colourStart.size(); ++c)
-    forPieces(
-        S.threads, S.colourStart[c], S.colourStart[c + 1], rowsPerTask,
-        [&](int k, int from, int to) { moved[k] = std::max(moved[k], visitRows(S, from, to)); });
+  std::vector<int> rows;
+  for (std::size_t c = 0; c + 1 < S.colourStart.size(); ++c) {
+    rows.clear();
+    for (int row = S.colourStart[c]; row < S.colourStart[c + 1]; ++row)
+      if (S.awake[S.order[row]].load(std::memory_order_relaxed)) rows.push_back(row);
+    S.report.visits += static_cast<long>(rows.size());
+    forPieces(S.crew, 0, static_cast<int>(rows.size()), rowsPerTask, [&](int k, int from, int to) {
+      moved[k] = std::max(moved[k], visitRows(S, &rows[from], to - from));
+    });
+  }
   const double disp = *std::max_element(moved.begin(), moved.end());
   countSweep(S, disp);
   return disp;
@@ -1408,7 +1485,7 @@ std::array<float, 3> difference(Vec3 a, Vec3 b) {
 /// σ after the sweep.
 void Anderson::recordSigma() {
   sigma_.resize(S.elements.size());
-  forPieces(S.threads, 0, static_cast<int>(sigma_.size()), piece, [&](int, int from, int to) {
+  forPieces(S.crew, 0, static_cast<int>(sigma_.size()), piece, [&](int, int from, int to) {
     for (int i = from; i < to; ++i) sigma_[i] = static_cast<float>(sigmaOf(S, S.elements[i]));
   });
 }
@@ -1447,13 +1524,13 @@ NormalEquations Anderson::normalEquations() const {
     }
     return sum;
   };
-  return sumOfPieces<NormalEquations>(S.threads, 0, rows(), piece, ofPiece);
+  return sumOfPieces<NormalEquations>(S.crew, 0, rows(), piece, ofPiece);
 }
 
 /// Moves the nodes by −Σ γ_j ΔG_j, but for those that it would move too little to be visited.
 void Anderson::mix(const std::array<double, mostMixed>& gamma) {
   const int m = std::min(recorded_, memory());
-  forPieces(S.threads, 0, rows(), piece, [&](int, int from, int to) {
+  forPieces(S.crew, 0, rows(), piece, [&](int, int from, int to) {
     for (int row = from; row < to; ++row) {
       Vec3 d;
       for (int j = 0; j < m; ++j)
@@ -1476,7 +1553,7 @@ constexpr double keptSigma = .5;
 bool Anderson::undoInvalid() {
   const int count = static_cast<int>(S.elements.size());
   std::vector<std::vector<int>> lost(count / piece + 1);
-  forPieces(S.threads, 0, count, piece, [&](int k, int from, int to) {
+  forPieces(S.crew, 0, count, piece, [&](int k, int from, int to) {
     for (int i = from; i < to; ++i)
       if (!(sigmaOf(S, S.elements[i]) > keptSigma * sigma_[i])) lost[k].push_back(S.elements[i]);
   });
@@ -1971,11 +2048,10 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   checkNodes(M);
   checkElements(M);
   Smoother S{M, options};
-  if (M.tets.empty()) return {0, 0, true, 0, 0, 0};
-  S.threads = options.accept ? 1
-              : options.threads > 0
-                  ? options.threads
-                  : static_cast<int>(std::max(1u, std::thread::hardware_concurrency()));
+  S.report.converged = true;
+  if (M.tets.empty()) return S.report;
+  const int cores = static_cast<int>(std::thread::hardware_concurrency());
+  S.crew.hire(options.accept ? 1 : options.threads > 0 ? options.threads : cores);
   buildFreedom(S);
   buildElements(S);
   buildCorners(S);

@@ -63,7 +63,7 @@ struct Run {
 };
 
 Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
-  const TriangleSurface S = samples::sine(.1, size.lc < .03 ? 160 : 64);
+  const TriangleSurface S = samples::sine(.1, 64);
   Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {size.cells, size.cells, size.cells});
   InsertOptions options = paper ? InsertOptions::paper() : InsertOptions{};
   options.lc = size.lc;
