@@ -906,6 +906,8 @@ std::vector<int> colourNodes(const Smoother& S, const Incidence& at) {
   return colour;
 }
 
+constexpr int piece = 4096;  // elements or rows of a light task
+
 /// The rows: free nodes by colour, each with its star.
 void buildStars(Smoother& S) {
   const Incidence at = tetsAtFreeNodes(S);
@@ -914,26 +916,30 @@ void buildStars(Smoother& S) {
     if (colour[n] >= 0) S.order.push_back(static_cast<int>(n));
   std::stable_sort(S.order.begin(), S.order.end(),
                    [&](int a, int b) { return colour[a] < colour[b]; });
-  S.star.reserve(at.item.size());
+  S.rowOf.assign(S.M.x.size(), -1);
+  S.starStart.assign(1, 0);
   for (std::size_t row = 0; row < S.order.size(); ++row) {
     const int n = S.order[row];
     if (row == 0 || colour[n] != colour[S.order[row - 1]])
       S.colourStart.push_back(static_cast<int>(row));
-    S.starStart.push_back(static_cast<int>(S.star.size()));
-    for (int j = at.start[n]; j < at.start[n + 1]; ++j) {
-      const int E = at.item[j];
-      const std::array<int, 4>& tet = S.M.tets[E];
-      const int k = static_cast<int>(std::find(tet.begin(), tet.end(), n) - tet.begin());
-      const int* o = opposite[k];
-      S.star.push_back({tet[o[0]], tet[o[1]], tet[o[2]], 4 * S.shapeOf[E] + k});
-    }
+    S.rowOf[n] = static_cast<int>(row);
+    S.starStart.push_back(S.starStart.back() + at.start[n + 1] - at.start[n]);
   }
-  S.rowOf.assign(S.M.x.size(), -1);
-  for (std::size_t row = 0; row < S.order.size(); ++row)
-    S.rowOf[S.order[row]] = static_cast<int>(row);
-  S.edge.assign(S.order.size(), 0);
   S.colourStart.push_back(static_cast<int>(S.order.size()));
-  S.starStart.push_back(static_cast<int>(S.star.size()));
+  S.edge.assign(S.order.size(), 0);
+  S.star.resize(at.item.size());
+  forPieces(S.crew, 0, static_cast<int>(S.order.size()), piece, [&](int, int from, int to) {
+    for (int row = from; row < to; ++row) {
+      const int n = S.order[row];
+      StarEntry* entry = &S.star[S.starStart[row]];
+      for (int j = at.start[n]; j < at.start[n + 1]; ++j, ++entry) {
+        const std::array<int, 4>& tet = S.M.tets[at.item[j]];
+        const int k = static_cast<int>(std::find(tet.begin(), tet.end(), n) - tet.begin());
+        const int* o = opposite[k];
+        *entry = {tet[o[0]], tet[o[1]], tet[o[2]], 4 * S.shapeOf[at.item[j]] + k};
+      }
+    }
+  });
 }
 
 struct SheetFace {
@@ -1047,9 +1053,14 @@ void buildSheets(Smoother& S) {
   if (M.faceLabel.empty() || M.dimension.empty()) return;
   std::vector<SheetFace> faces = sheetFaces(M, S.elements);
   orientSheets(faces);
+  std::vector<char> counts(faces.size(), 0);
+  forPieces(S.crew, 0, static_cast<int>(faces.size()), piece, [&](int, int from, int to) {
+    for (int i = from; i < to; ++i) counts[i] = faces[i].area != 0 && !isBridge(M, faces[i]);
+  });
   std::vector<std::pair<int, SheetTriangle>> entries;
-  for (const SheetFace& f : faces) {
-    if (f.area == 0 || isBridge(M, f)) continue;
+  for (std::size_t face = 0; face < faces.size(); ++face) {
+    if (!counts[face]) continue;
+    const SheetFace& f = faces[face];
     for (int i = 0; i < 3; ++i)
       if (S.freedom[f.v[i]] == 1 || S.freedom[f.v[i]] == 2)
         entries.push_back({f.v[i], {f.v[(i + 1) % 3], f.v[(i + 2) % 3], f.label}});
@@ -1061,8 +1072,6 @@ void buildSheets(Smoother& S) {
   std::vector<int> next = S.sheetStart;
   for (const auto& entry : entries) S.sheet[next[entry.first]++] = entry.second;
 }
-
-constexpr int piece = 4096;  // elements or rows of a light task
 
 double sigmaOf(const Smoother& S, int E) {
   const std::array<Vec3, 4> x = cornersOf(S.M.x, S.M.tets[E]);
@@ -1458,12 +1467,14 @@ class Anderson {
 
 std::vector<Vec3> Anderson::states() const {
   std::vector<Vec3> x(S.order.size());
-  for (int row = 0; row < rows(); ++row) {
-    const int n = S.order[row];
-    if (S.freedom[n] == 3) x[row] = S.M.x[n];
-    if (S.freedom[n] == 2 && !S.options.accept)
-      x[row] = {S.M.parameter[n].x, S.M.parameter[n].y, 0};
-  }
+  forPieces(S.crew, 0, rows(), piece, [&](int, int from, int to) {
+    for (int row = from; row < to; ++row) {
+      const int n = S.order[row];
+      if (S.freedom[n] == 3) x[row] = S.M.x[n];
+      if (S.freedom[n] == 2 && !S.options.accept)
+        x[row] = {S.M.parameter[n].x, S.M.parameter[n].y, 0};
+    }
+  });
   return x;
 }
 
@@ -1494,15 +1505,17 @@ void Anderson::recordSigma() {
 void Anderson::record() {
   plain_ = states();
   r_.resize(plain_.size());
-  for (int row = 0; row < rows(); ++row) r_[row] = difference(plain_[row], start_[row]);
-  if (recorded_ == 0) return;
-  const int place = (recorded_ - 1) % memory();
-  dR_[place].resize(r_.size());
-  dG_[place].resize(r_.size());
-  for (int row = 0; row < rows(); ++row) {
-    for (int k = 0; k < 3; ++k) dR_[place][row][k] = r_[row][k] - lastR_[row][k];
-    dG_[place][row] = difference(plain_[row], lastPlain_[row]);
-  }
+  const bool hasLast = recorded_ > 0;
+  const int place = hasLast ? (recorded_ - 1) % memory() : 0;
+  if (hasLast) dR_[place].resize(r_.size()), dG_[place].resize(r_.size());
+  forPieces(S.crew, 0, rows(), piece, [&](int, int from, int to) {
+    for (int row = from; row < to; ++row) {
+      r_[row] = difference(plain_[row], start_[row]);
+      if (!hasLast) continue;
+      for (int k = 0; k < 3; ++k) dR_[place][row][k] = r_[row][k] - lastR_[row][k];
+      dG_[place][row] = difference(plain_[row], lastPlain_[row]);
+    }
+  });
 }
 
 NormalEquations Anderson::normalEquations() const {
@@ -1871,28 +1884,37 @@ WorstElements reachedElements(Smoother& S) {
   return worst;
 }
 
+/// The k-th lowest of q (k < q.size()), looked for below a guess first.
+double lowestOf(const std::vector<double>& q, std::size_t k, double guess) {
+  std::vector<double> low;
+  for (double value : q)
+    if (value <= guess) low.push_back(value);
+  if (low.size() <= k) low = q;
+  const auto at = low.begin() + static_cast<std::ptrdiff_t>(k);
+  std::nth_element(low.begin(), at, low.end());
+  return *at;
+}
+
 /// Anew after sweeps: q of the elements at nodes that have moved since, and what follows from them.
 void updateWorst(Smoother& S, WorstElements& worst) {
-  std::vector<int> changed;  // places in worst.element
-  std::vector<int> elements;
-  for (std::size_t i = 0; i < worst.q.size(); ++i)
-    if (isAtAny(S.moved, S.M.tets[worst.element[i]])) {
-      changed.push_back(static_cast<int>(i));
-      elements.push_back(worst.element[i]);
-    }
-  const std::vector<double> now = qualitiesOf(S, elements);
-  for (std::size_t i = 0; i < changed.size(); ++i) worst.q[changed[i]] = now[i];
+  const int count = static_cast<int>(worst.q.size());
+  if (count == 0) return;
+  const auto ofPiece = [&](int, int from, int to) {
+    std::vector<int> places, elements;
+    for (int i = from; i < to; ++i)
+      if (isAtAny(S.moved, S.M.tets[worst.element[i]]))
+        places.push_back(i), elements.push_back(worst.element[i]);
+    const std::vector<double> now = qualitiesOf(S, elements);  // one piece: no crew within a crew
+    for (std::size_t i = 0; i < places.size(); ++i) worst.q[places[i]] = now[i];
+  };
+  forPieces(S.crew, 0, count, piece, ofPiece);
   S.moved.assign(S.moved.size(), 0);
-
-  std::vector<double> q = worst.q;
-  if (q.empty()) return;
-  const double count = static_cast<double>(q.size());
-  const std::size_t wanted = std::max(worstCount, static_cast<std::size_t>(worstFraction * count));
-  const auto bound = q.begin() + static_cast<std::ptrdiff_t>(std::min(q.size(), wanted)) - 1;
-  std::nth_element(q.begin(), bound, q.end());
-  worst.lowest = *std::min_element(q.begin(), bound + 1);
-  worst.mean = std::accumulate(q.begin(), q.end(), 0.) / count;
-  worst.bound = *bound;
+  constexpr double wide = 1.1;  // the bound rises little from one round to the next
+  const std::size_t part = static_cast<std::size_t>(worstFraction * count);
+  const std::size_t wanted = std::min(worst.q.size(), std::max(worstCount, part));
+  worst.bound = lowestOf(worst.q, wanted - 1, wide * worst.bound);
+  worst.lowest = *std::min_element(worst.q.begin(), worst.q.end());
+  worst.mean = std::accumulate(worst.q.begin(), worst.q.end(), 0.) / count;
 }
 
 /// One round: sweeps on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes on at whose elements the
