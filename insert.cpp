@@ -3670,24 +3670,38 @@ void checkDisk(const TriangleSurface& S) {
 
 std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S,
                                                    const std::vector<int>& number) {
-  std::vector<std::pair<std::uint64_t, int>> uses;  // edge, 3 t + i of the triangle that uses it
-  for (int c = 0; c < static_cast<int>(3 * S.triangles.size()); ++c) {
-    const std::array<int, 3>& v = S.triangles[c / 3];
-    uses.push_back({edgeKey(v[c % 3], v[(c + 1) % 3]), c});
-  }
-  std::sort(uses.begin(), uses.end());
+  // the edges by their lower point, at which few meet: the other point, 3 t + i of those that use
+  // it
+  struct Edge {
+    int high, first, second;
+  };
+  std::vector<int> start(S.points.size() + 1, 0);
+  const int uses = static_cast<int>(3 * S.triangles.size());
+  auto ends = [&](int c) {
+    return std::minmax(S.triangles[c / 3][c % 3], S.triangles[c / 3][(c + 1) % 3]);
+  };
+  for (int c = 0; c < uses; ++c) ++start[ends(c).first + 1];
+  std::partial_sum(start.begin(), start.end(), start.begin());
+  std::vector<Edge> edges(uses);
+  std::vector<int> filled(start.begin(), start.end() - 1);
   auto name = [&](int c) { return std::to_string(number.empty() ? c / 3 : number[c / 3]); };
   std::vector<std::array<int, 3>> neighbours(S.triangles.size(), {-1, -1, -1});
-  for (std::size_t k = 0; k + 1 < uses.size(); ++k) {
-    if (uses[k].first != uses[k + 1].first) continue;
-    const int c = uses[k].second, d = uses[k + 1].second;
-    if (k + 2 < uses.size() && uses[k].first == uses[k + 2].first)
-      refuseSurface("the edge from " + placeText(S.points[uses[k].first >> 32]) + " to " +
-                    placeText(S.points[uses[k].first & 0xffffffff]) +
-                    " is non-manifold: triangles " + name(c) + ", " + name(d) + " and " +
-                    name(uses[k + 2].second) + " share it; split the surface there into several");
-    neighbours[c / 3][c % 3] = d / 3;
-    neighbours[d / 3][d % 3] = c / 3;
+  for (int c = 0; c < uses; ++c) {
+    const auto [low, high] = ends(c);
+    int e = start[low];
+    while (e < filled[low] && edges[e].high != high) ++e;
+    if (e == filled[low]) {
+      edges[filled[low]++] = {high, c, -1};
+      continue;
+    }
+    const int first = edges[e].first, second = std::exchange(edges[e].second, c);
+    if (second >= 0)
+      refuseSurface("the edge from " + placeText(S.points[low]) + " to " +
+                    placeText(S.points[high]) + " is non-manifold: triangles " + name(first) +
+                    ", " + name(second) + " and " + name(c) +
+                    " share it; split the surface there into several");
+    neighbours[first / 3][first % 3] = c / 3;
+    neighbours[c / 3][c % 3] = first / 3;
   }
   return neighbours;
 }
@@ -4207,8 +4221,7 @@ Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
   return gapWithin(tree, points, triangles, beyondAll);
 }
 
-std::vector<Crossing> selfCrossings(const TriangleSurface& S) {
-  const TriangleTree tree(S.points, S.triangles);
+std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& tree) {
   std::vector<Crossing> crossings;
   for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
     const TriangleTree::Box box = boxOf(cornersOf(S, t));
@@ -4219,6 +4232,10 @@ std::vector<Crossing> selfCrossings(const TriangleSurface& S) {
     });
   }
   return crossings;
+}
+
+std::vector<Crossing> selfCrossings(const TriangleSurface& S) {
+  return selfCrossings(S, TriangleTree(S.points, S.triangles));
 }
 
 namespace {
@@ -4517,7 +4534,7 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
   const int level = cubeLevel(M, size.lc);
   const double diagonal = norm(M.cube) * std::exp2(-level / 3);
   if (predictedTets(areaOf(S.S), diagonal / root3) > mostTets && 2 * diagonal < largest &&
-      !selfCrossings(S.S).empty())
+      !selfCrossings(S.S, S.tree).empty())
     size.lc = size.finest = 2 * diagonal * aboveDiagonal;
 
   const double near = perBoundary * size.lc / root3;  // farther ones do not limit l_c
@@ -7367,7 +7384,7 @@ std::string advice(const Insertion& I, const Mesh& M, double largest, double lc)
   const Nearest nearest = nearestEarlier(M, S);
   if (nearest.distance < largest)
     return nearest.text + ": lower l_c to " + number(.5 * nearest.distance);
-  const std::vector<Crossing> crossings = selfCrossings(S.S);
+  const std::vector<Crossing> crossings = selfCrossings(S.S, S.tree);
   if (!crossings.empty()) return describe(crossings) + ": mend S there";
   const SizeChoice size = chooseSize(M, S);
   const bool isExtent = size.measure == extentOf(S);
@@ -7439,11 +7456,12 @@ struct Candidate {
 Candidate candidateOf(const TriangleSurface& S, const std::string& label,
                       std::vector<std::string> warnings = {}) {
   TriangleSurface disk = checkSurface(S, warnings);
-  const std::vector<Crossing> crossings = selfCrossings(disk);
+  splitChords(disk);
+  SurfaceDistance distance(disk);
+  const std::vector<Crossing> crossings = selfCrossings(disk, distance.tree);
   if (!crossings.empty())
     warnings.push_back(describe(crossings) + "; mend it there if the insertion fails");
-  splitChords(disk);
-  return {SurfaceDistance(disk), label, std::move(warnings), !crossings.empty()};
+  return {std::move(distance), label, std::move(warnings), !crossings.empty()};
 }
 
 /// Does what step() does; its errors begin with the label of the surface.

@@ -684,6 +684,7 @@ struct Crossing {
   Vec3 point;
 };
 std::vector<Crossing> selfCrossings(const TriangleSurface& S);
+std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& ofS);
 
 /// [§3.2] The distance of sheets of S that face each other: the 5 % quantile over S of the distance
 /// along the normals; 1e300 where none is within `reach`.
