@@ -1,17 +1,19 @@
 // SPDX-License-Identifier: MIT
 //
-// `make bench`: seconds of each stage of insertSurface, tetrahedra per second, sweeps, the
-// process's peak memory per tetrahedron, and the exponent of the growth from one size to the next.
-// Then what the seventh of seven surfaces costs.
-// The surface is §4.1's sine, A = .1, finer than the mesh at each size.
+// `make bench`: seconds of each stage of insertSurface, tetrahedra per second, sweeps, visits per
+// node, the process's peak memory per tetrahedron, and the exponent of the growth from one size to
+// the next. Then what the seventh of seven surfaces costs.
+// The surface is §4.1's sine, A = .1, of 8192 triangles at each size.
 #include <sys/resource.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
 #include <ctime>
 #include <map>
+#include <vector>
 
 #include "../samples/surfaces.hpp"
 
@@ -59,7 +61,7 @@ double peakBytes() {
 
 /// What one run takes.
 struct Run {
-  double tets = 0, seconds = 0, optimizing = 0;
+  double tets = 0, seconds = 0, smoothed = 0, optimizing = 0;  // optimizing: without measuring S_M
 };
 
 Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
@@ -68,23 +70,30 @@ Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
   InsertOptions options = paper ? InsertOptions::paper() : InsertOptions{};
   options.lc = size.lc;
   options.optimize.threads = threads;
+  Run run;
   std::map<std::string, double> seconds;
   Clock clock(threads > 1);
   options.onStage = [&](const char* stage, const Mesh&) { seconds[stage] += clock.lap(); };
-  Run run;
+  options.onProgress = [&](const std::string& line) {
+    if (line.rfind("3.7 optimization", 0) != 0) return;
+    const double lap = clock.lap();
+    run.optimizing += lap, seconds["smoothed"] += lap;
+  };
   try {
     const InsertReport report = insertSurface(M, S, options);
     const double tail = clock.lap();  // the checks and figures of the report
-    run = {static_cast<double>(M.tets.size()), tail, seconds["smoothed"]};
+    run.tets = static_cast<double>(M.tets.size());
+    run.seconds = tail, run.smoothed = seconds["smoothed"];
     std::printf("%8d %6g %3d ", static_cast<int>(M.tets.size()), size.lc, threads);
     for (const char* stage : stages) {
       std::printf("%9.3f", seconds[stage]);
       run.seconds += seconds[stage];
     }
-    std::printf(" %9.0f %7.0f %6.0f %% %6d %6.0f %6.3f %6.3f", run.tets / run.seconds,
-                1e9 * run.seconds / run.tets, 100 * (1 - run.optimizing / run.seconds),
-                report.optimization.sweeps, peakBytes() / run.tets, report.smoothed.min,
-                report.smoothed.mean);
+    const double visits = static_cast<double>(report.optimization.visits);
+    std::printf(" %9.0f %7.0f %6.0f %% %6d %6.1f %6.0f %6.3f %6.3f", run.tets / run.seconds,
+                1e9 * run.seconds / run.tets, 100 * (1 - run.smoothed / run.seconds),
+                report.optimization.sweeps, visits / static_cast<double>(M.x.size()),
+                peakBytes() / run.tets, report.smoothed.min, report.smoothed.mean);
     if (smaller.tets > 0)
       std::printf(" %6.2f",
                   std::log(run.seconds / smaller.seconds) / std::log(run.tets / smaller.tets));
@@ -99,7 +108,7 @@ Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
 /// Seven sheets beside each other, .3 apart, one after the other: the CPU seconds of the seventh
 /// against those of the same sheet alone in the same box.
 void benchSeventh() {
-  const int cells = 5;
+  constexpr int cells = 5, repeats = 9;
   const Mesh box = boxMesh({0, 0, 0}, {4, 2, 1}, {4 * cells, 2 * cells, cells});
   InsertOptions options;
   options.lc = .045, options.optimize.threads = 1;
@@ -108,22 +117,22 @@ void benchSeventh() {
     for (Vec3& p : S.points) p = p + Vec3{double(place / 2), double(place % 2), 0};
     return S;
   };
-  const auto seconds = [&](const Mesh& start, int place, Mesh& M) {
-    double least = 1e300;
-    for (int k = 0; k < 3; ++k) {
-      M = start;
-      Clock clock(false);
-      insertSurface(M, sheetAt(place), options);
-      least = std::min(least, clock.lap());
-    }
-    return least;
-  };
   Mesh six = box, M;
   for (int place = 0; place < 6; ++place) insertSurface(six, sheetAt(place), options);
-  const double alone = seconds(box, 6, M), seventh = seconds(six, 6, M);
+  std::vector<double> alone, seventh;
+  for (int k = 0; k < repeats; ++k)
+    for (std::vector<double>* seconds : {&alone, &seventh}) {
+      M = seconds == &alone ? box : six;
+      Clock clock(false);
+      insertSurface(M, sheetAt(6), options);
+      seconds->push_back(clock.lap());
+    }
+  std::sort(alone.begin(), alone.end()), std::sort(seventh.begin(), seventh.end());
+  const double one = alone[repeats / 2], last = seventh[repeats / 2];
   std::printf(
-      "seven sheets, l_c = .045, %d tetrahedra: the seventh %.3f s, alone %.3f s, ratio %.2f\n",
-      static_cast<int>(M.tets.size()), seventh, alone, seventh / alone);
+      "seven sheets, l_c = .045, %d tetrahedra, medians of %d: the seventh %.3f s, alone %.3f s, "
+      "ratio %.2f\n",
+      static_cast<int>(M.tets.size()), repeats, last, one, last / one);
 }
 
 }  // namespace
@@ -143,7 +152,7 @@ int main(int argc, char** argv) {
       paper ? ", paper()" : "");
   std::printf(
       "    tets    l_c thr   refine     heal  extract s.healing project optimize    tets/s ns/tet  "
-      "not opt. sweeps B/tet    min   mean growth\n");
+      "not opt. sweeps visits B/tet    min   mean growth\n");
   Run last;
   for (int i = 0; i < count && i < sizeCount; ++i) {
     const Run one = benchOne(sizes[i], paper, 1, last);
