@@ -7006,6 +7006,7 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
     if (!valid) optimize.active.clear(), optimize.maxTangledSweeps = patientSweeps;
     OptimizeReport after = optimizeMesh(trial, optimize);
     after.sweeps += best.sweeps;
+    after.visits += best.visits;
     const bool better =
         valid ? after.inverted == 0 && after.minQ > best.minQ : after.inverted < best.inverted;
     if (!better && (!valid || ++factor == std::end(factors))) return;
@@ -7202,6 +7203,7 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
     if (after.hausdorff >= report.hausdorff) return;
     if (enough && after.smoothed.min < report.smoothed.min - betterBy) return;
     after.optimization.sweeps += report.optimization.sweeps;
+    after.optimization.visits += report.optimization.visits;
     M = std::move(trial), report = after;
   }
 }

@@ -299,6 +299,8 @@ TEST_SUITE("3") {
     CHECK(report.lc == .12);
     CHECK(report.hausdorff <= .45 * .12);  // .53 and more before
     CHECK(literalHausdorff(M, 1, S) <= .45 * .12);
+    const double nodes = static_cast<double>(M.x.size());
+    CHECK(report.optimization.visits > 20 * nodes);  // 34; of the last call alone 12
   }
 
   TEST_CASE("insertion: two fingers, whose sides end low, through the middle of T") {
