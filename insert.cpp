@@ -6986,7 +6986,7 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
   constexpr double factors[] = {1.1, 1.3, 1.7, 2.2};  // of the lowest q, in turn while it stays
   OptimizeOptions optimize = I.options.optimize;
   optimize.globalDescent = false;
-  optimize.active = active;
+  if (I.options.outline != Outline::paper) optimize.active = active;  // the paper: all nodes
   if (!patient) optimize.maxTangledSweeps = std::min(optimize.maxTangledSweeps, impatientSweeps);
   OptimizeReport& best = report.optimization;
   best = optimizeMesh(M, optimize);
