@@ -2078,9 +2078,9 @@ std::array<int, 4> sortedCorners(const std::array<int, 4>& z) {
 std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
   const int nodes = static_cast<int>(M.x.size()), count = static_cast<int>(M.tets.size());
   std::vector<std::array<int, 4>> neighbour(count, {-1, -1, -1, -1});
-  // Faces grouped by their largest node, the youngest one, at which few elements meet; within a
-  // group equal faces are found by comparing the other two. Of the sorted nodes of an element three
-  // faces end with the last, one with the second to last.
+  // Faces grouped by their largest node, of a bisected mesh the youngest one, at which few elements
+  // meet; within a group equal faces are found by comparing the other two. Of the sorted nodes of
+  // an element three faces end with the last, one with the second to last.
   std::vector<int> start(nodes + 1, 0);
   for (const std::array<int, 4>& z : M.tets) {
     const std::array<int, 4> o = sortedCorners(z);
@@ -2437,9 +2437,13 @@ void Bisection::keepForUndo(int E) {
   before.push_back({E, M.tets[E], neighbour[E], M.faceLabel[E], M.type[E], M.level[E]});
 }
 
-void Bisection::beginTrial() { undoNodes = M.x.size(), undoTets = static_cast<int>(M.tets.size()); }
+Bisection::Trial::Trial(Bisection& bisection) : B(bisection) {
+  B.undoNodes = B.M.x.size(), B.undoTets = static_cast<int>(B.M.tets.size());
+}
 
-void Bisection::undoTrial() {
+Bisection::Trial::~Trial() { B.undo(); }
+
+void Bisection::undo() {
   M.x.resize(undoNodes), M.xi.resize(undoNodes), M.parameter.resize(undoNodes);
   M.dimension.resize(undoNodes), M.entity.resize(undoNodes), tetOf.resize(undoNodes);
   for (auto b = before.rbegin(); b != before.rend(); ++b) {
@@ -3226,7 +3230,7 @@ constexpr double stuckQuality = .3, stuckPart = 1.2;
 /// refined again.
 enum class Slide { between, atLast, again };
 
-/// Algorithm 2 on all nodes, first on the active ones (none given: all); a boundary node is not
+/// Algorithm 2 on the nodes near the active ones (none given: on all); a boundary node is not
 /// moved where a face beside it gets farther than allowed and worse. At last the worst elements are
 /// lifted, and again where the lowest quality has fallen below that before.
 OptimizeReport slideWithin(Mesher& W, double allowed, Slide slide,
@@ -3670,16 +3674,20 @@ void checkDisk(const TriangleSurface& S) {
 
 std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S,
                                                    const std::vector<int>& number) {
-  // the edges by their lower point, at which few meet: the other point, 3 t + i of those that use
-  // it
+  // The edges by the end at which fewer triangles meet: the other end, 3 t + i of those that use
+  // it. The sum of these smaller degrees is linear on every surface.
   struct Edge {
-    int high, first, second;
+    int far, first, second;
   };
-  std::vector<int> start(S.points.size() + 1, 0);
-  const int uses = static_cast<int>(3 * S.triangles.size());
+  std::vector<int> degree(S.points.size(), 0), start(S.points.size() + 1, 0);
+  for (const std::array<int, 3>& t : S.triangles)
+    for (int n : t) ++degree[n];
   auto ends = [&](int c) {
-    return std::minmax(S.triangles[c / 3][c % 3], S.triangles[c / 3][(c + 1) % 3]);
+    const int a = S.triangles[c / 3][c % 3], b = S.triangles[c / 3][(c + 1) % 3];
+    const bool fromA = std::tie(degree[a], a) < std::tie(degree[b], b);
+    return fromA ? std::pair(a, b) : std::pair(b, a);
   };
+  const int uses = static_cast<int>(3 * S.triangles.size());
   for (int c = 0; c < uses; ++c) ++start[ends(c).first + 1];
   std::partial_sum(start.begin(), start.end(), start.begin());
   std::vector<Edge> edges(uses);
@@ -3687,18 +3695,18 @@ std::vector<std::array<int, 3>> triangleNeighbours(const TriangleSurface& S,
   auto name = [&](int c) { return std::to_string(number.empty() ? c / 3 : number[c / 3]); };
   std::vector<std::array<int, 3>> neighbours(S.triangles.size(), {-1, -1, -1});
   for (int c = 0; c < uses; ++c) {
-    const auto [low, high] = ends(c);
-    int e = start[low];
-    while (e < filled[low] && edges[e].high != high) ++e;
-    if (e == filled[low]) {
-      edges[filled[low]++] = {high, c, -1};
+    const auto [near, far] = ends(c);
+    int e = start[near];
+    while (e < filled[near] && edges[e].far != far) ++e;
+    if (e == filled[near]) {
+      edges[filled[near]++] = {far, c, -1};
       continue;
     }
     const int first = edges[e].first, second = std::exchange(edges[e].second, c);
     if (second >= 0)
-      refuseSurface("the edge from " + placeText(S.points[low]) + " to " +
-                    placeText(S.points[high]) + " is non-manifold: triangles " + name(first) +
-                    ", " + name(second) + " and " + name(c) +
+      refuseSurface("the edge from " + placeText(S.points[std::min(near, far)]) + " to " +
+                    placeText(S.points[std::max(near, far)]) + " is non-manifold: triangles " +
+                    name(first) + ", " + name(second) + " and " + name(c) +
                     " share it; split the surface there into several");
     neighbours[first / 3][first % 3] = c / 3;
     neighbours[c / 3][c % 3] = first / 3;
@@ -4927,12 +4935,11 @@ DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDist
     for (int n : B.M.tets[E])
       if (lattice.isNode(B.M.xi[n]) && !seen[n] && !isOnBoundary(B.M, n))
         seen[n] = 1, nodes.push_back(n);
+  const Bisection::Trial trial(B);
   Approximation layer = A;
-  B.beginTrial();
   for (int n : nodes) addElementsAt(B, layer, n);
   const Cubes cubes(B.M, layer);
   const std::vector<char> isAbove = minimumCut(graphOf(B.M, layer, cubes, S, perDistance));
-  B.undoTrial();
   DividedCubes divided;
   KeyMap cornersAbove;
   for (std::size_t c = 0; c < isAbove.size(); ++c) {
@@ -6830,24 +6837,17 @@ std::string leftOut(const Insertion& I, const Selection& selected) {
 /// .004 in the lowest q): one is enough.
 constexpr double mirrored = .01;
 
-/// A copy with room to grow: vectors that double are copied again and again.
-Mesh roomyCopy(const Mesh& M, double tets) {
+/// A copy with room for more: vectors that double are copied again and again.
+Mesh roomyCopy(const Mesh& M, double moreTets) {
   constexpr double nodesPerTet = .22;  // of fine meshes
-  const std::size_t more = static_cast<std::size_t>(tets);
-  const std::size_t moreNodes = static_cast<std::size_t>(nodesPerTet * tets);
+  const std::size_t tets = M.tets.size() + static_cast<std::size_t>(moreTets);
+  const std::size_t nodes = M.x.size() + static_cast<std::size_t>(nodesPerTet * moreTets);
   Mesh copy;
-  const auto grow = [](auto& to, const auto& from, std::size_t by) {
-    to.reserve(from.size() + by);
-    to = from;
-  };
-  grow(copy.x, M.x, moreNodes), grow(copy.xi, M.xi, moreNodes);
-  grow(copy.dimension, M.dimension, moreNodes), grow(copy.entity, M.entity, moreNodes);
-  grow(copy.parameter, M.parameter, moreNodes);
-  grow(copy.tets, M.tets, more), grow(copy.faceLabel, M.faceLabel, more);
-  grow(copy.type, M.type, more), grow(copy.level, M.level, more);
-  copy.cube = M.cube;
-  copy.patches = M.patches, copy.surfaces = M.surfaces;
-  copy.curves = M.curves, copy.corners = M.corners;
+  copy.x.reserve(nodes), copy.xi.reserve(nodes), copy.parameter.reserve(nodes);
+  copy.dimension.reserve(nodes), copy.entity.reserve(nodes);
+  copy.tets.reserve(tets), copy.faceLabel.reserve(tets);
+  copy.type.reserve(tets), copy.level.reserve(tets);
+  copy = M;
   return copy;
 }
 

@@ -191,7 +191,7 @@ struct QualityStatistics {
 
 // ==== Options and reports =======================================================================
 
-/// One sweep of Algorithm 2, for a progress display.
+/// One sweep of Algorithm 2, for a progress display: of the elements that may change.
 struct Sweep {
   int number, inverted;
   double minQ, disp;
@@ -219,7 +219,7 @@ struct OptimizeOptions {
   // [§3.7.4 departure] sweeps that Anderson's acceleration mixes; [0, 8], 0: none
   int acceleration = 4;
   std::vector<int> fixed = {};  // nodes that stay where they are, besides the corners
-  // nodes visited in the first sweep: only these and nodes near them move; empty: all
+  // nodes visited in the first sweep: only these and nodes up to four edges away move; empty: all
   std::vector<int> active = {};
   // [§2 choice] δ from each star's own σ, for meshes whose σ spans orders of magnitude
   bool starDelta = false;
@@ -231,9 +231,9 @@ struct OptimizeOptions {
 };
 
 struct OptimizeReport {
-  int sweeps = 0;   // of all phases; a sweep visits the nodes whose stars have moved
-  long visits = 0;  // of nodes, in all sweeps
-  double disp = 0;  // of Algorithm 2's last sweep (before the worst elements), as maxDisp
+  int sweeps = 0;           // of all phases; a sweep visits the nodes whose stars have moved
+  std::int64_t visits = 0;  // of nodes, in all sweeps
+  double disp = 0;          // of Algorithm 2's last sweep (before the worst elements), as maxDisp
   // valid and disp <= maxDisp (where the worst elements are lifted next: its root mean square <= 2
   // maxDisp) before maxSweeps
   bool converged = false;
@@ -407,10 +407,15 @@ struct Bisection {
   void ring(int E, int a, int b, std::vector<int>& around) const;
   void star(int n, std::vector<int>& around) const;
   int tetWithEdge(int a, int b) const;
-  /// undoTrial() takes the bisections since beginTrial() back: the mesh and its adjacency are as
-  /// they were; the log is empty.
-  void beginTrial();
-  void undoTrial();
+  /// Takes the bisections back at its end: the mesh and its adjacency are as they were, the log is
+  /// empty. One at a time.
+  struct Trial {
+    Bisection& B;
+    explicit Trial(Bisection& B);
+    Trial(const Trial&) = delete;
+    Trial& operator=(const Trial&) = delete;
+    ~Trial();
+  };
 
   /// Dimension and number (as in Mesh::entity) of what the edge (a, b) lies on.
   struct EdgeEntity {
@@ -424,12 +429,13 @@ struct Bisection {
     std::array<int, 4> tet, neighbour, label;
     unsigned char type, level;
   };
-  std::vector<Before> before;  // what has changed since beginTrial(), oldest first
+  std::vector<Before> before;  // what has changed in a trial, oldest first
   std::size_t undoNodes = 0;
   int undoTets = -1;  // -1: no trial
 
   int addMidpoint(int a, int b, const std::vector<int>& around);
   void keepForUndo(int E);
+  void undo();
   void bisectRing(const std::vector<int>& around);
 };
 
@@ -456,8 +462,8 @@ bool parameterOn(const Mesh& M, int n, int label, Vec2& u);
 
 /// The surface or patch with a label as in Mesh::faceLabel.
 const Parametrization& surfaceOf(const Mesh& M, int label);
-/// Faces labelled k (S_M of inserted surface k, or boundary patch -k), each once. [faces], node
-/// indices
+/// Faces labelled k, not 0 (S_M of inserted surface k, or boundary patch -k), each once. [faces],
+/// node indices
 std::vector<std::array<int, 3>> surfaceFaces(const Mesh& M, int k);
 
 // ==== 2. Algorithm 1: the meccano mesher ========================================================
@@ -684,7 +690,7 @@ struct Crossing {
   Vec3 point;
 };
 std::vector<Crossing> selfCrossings(const TriangleSurface& S);
-std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& ofS);
+std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& tree);
 
 /// [§3.2] The distance of sheets of S that face each other: the 5 % quantile over S of the distance
 /// along the normals; 1e300 where none is within `reach`.
@@ -820,7 +826,8 @@ bool removeThinProtrusions(const SquareSurface& Q, Selection& selected);
 /// [§3.5.2] Adds the square in the plane of the two rim edges at rim nodes with five or more
 /// triangles.
 bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected);
-/// The elements with a node of S_M, surface k, ascending: the `near` of the rules that follow.
+/// The elements with a node of S_M, surface k: `near`, of the rules that follow, has at least
+/// these.
 std::vector<int> elementsAt(const Mesh& M, int k);
 /// [§3.5.3] Refines tetrahedra with more than one face on S_M.
 bool refineTetrahedraWithTwoFaces(Bisection& B, int k, const std::vector<int>& near);

@@ -636,7 +636,7 @@ void Crew::hire(int threads) {
 }
 
 void Crew::serve() {
-  constexpr int patience = 200;  // looks for a job before it sleeps: some 100 μs
+  constexpr int patience = 200;  // [choice] looks for a job before it sleeps: some 100 μs
   unsigned seen = 0;
   for (;;) {
     for (int k = 0; k < patience && round_ == seen; ++k) std::this_thread::yield();
@@ -984,7 +984,7 @@ void turn(SheetFace& f) {
 }
 
 /// Orients each sheet's faces alike, and so that most of its area in 𝓤 is counter-clockwise: a
-/// folded face is then known as one.
+/// folded face is then known as one. Of a sheet that reaches beyond S.elements, the part in them.
 void orientSheets(std::vector<SheetFace>& faces) {
   struct Edge {
     int label, lo, hi;
@@ -1384,7 +1384,7 @@ double sweepNodes(Smoother& S) {
     rows.clear();
     for (int row = S.colourStart[c]; row < S.colourStart[c + 1]; ++row)
       if (S.awake[S.order[row]].load(std::memory_order_relaxed)) rows.push_back(row);
-    S.report.visits += static_cast<long>(rows.size());
+    S.report.visits += static_cast<std::int64_t>(rows.size());
     forPieces(S.crew, 0, static_cast<int>(rows.size()), rowsPerTask, [&](int k, int from, int to) {
       moved[k] = std::max(moved[k], visitRows(S, &rows[from], to - from));
     });
@@ -1812,8 +1812,8 @@ struct MuSchedule {
 };
 
 /// [§3.7.4, Algorithm 2] optimizeMesh's loop. While elements are inverted δ comes from the σ_min of
-/// the whole mesh and holds for all nodes; afterwards it is 0, and a move that would invert an
-/// element has f = ∞. Returns whether it converged on a valid mesh.
+/// all elements that may change and holds for all nodes; afterwards it is 0, and a move that would
+/// invert an element has f = ∞. Returns whether it converged on a valid mesh.
 bool untangleAndSmooth(Smoother& S) {
   MuSchedule schedule;
   bool tangled = true;
@@ -2065,6 +2065,19 @@ OptimizeOptions OptimizeOptions::paper() {
   return options;
 }
 
+namespace {
+
+/// As many threads as are wanted, and as have something to do.
+void hireCrew(Smoother& S) {
+  constexpr int elementsPerThread = 500;  // fewer are not worth one
+  const int cores = static_cast<int>(std::thread::hardware_concurrency());
+  const int wanted = S.options.threads > 0 ? S.options.threads : cores;
+  const int useful = 1 + static_cast<int>(S.elements.size()) / elementsPerThread;
+  S.crew.hire(S.options.accept ? 1 : std::min(wanted, useful));
+}
+
+}  // namespace
+
 OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   checkOptions(options, M.x.size());
   checkNodes(M);
@@ -2072,10 +2085,9 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   Smoother S{M, options};
   S.report.converged = true;
   if (M.tets.empty()) return S.report;
-  const int cores = static_cast<int>(std::thread::hardware_concurrency());
-  S.crew.hire(options.accept ? 1 : options.threads > 0 ? options.threads : cores);
   buildFreedom(S);
   buildElements(S);
+  hireCrew(S);
   buildCorners(S);
   buildStars(S);
   buildSheets(S);
@@ -2116,18 +2128,16 @@ struct Jacobians {
 };
 
 /// From the edges a, b, c of E^I and p_k of E^P: J = Σ p_k g_kᵀ with the gradients g_0 = b × c/det
-/// I and so on, hence ‖J‖² = Σ_kl (p_k·p_l)(g_k·g_l).
+/// I and so on.
 Jacobians jacobiansOf(const EdgeBlock& ideal, const EdgeBlock& physical) {
   Jacobians J;
   for (int i = 0; i < lanes; ++i) {
-    const Vec3 a = ideal.edge(0, i), b = ideal.edge(1, i), c = ideal.edge(2, i);
-    const Vec3 g0 = cross(b, c), g1 = cross(c, a), g2 = cross(a, b);  // times det I
+    const Vec3 a = ideal.edge(0, i), b = ideal.edge(1, i), c = ideal.edge(2, i), bc = cross(b, c);
+    const double perVolume = 1 / dot(a, bc);
+    const Vec3 g0 = perVolume * bc, g1 = perVolume * cross(c, a), g2 = perVolume * cross(a, b);
     const Vec3 p0 = physical.edge(0, i), p1 = physical.edge(1, i), p2 = physical.edge(2, i);
-    const double perVolume = 1 / dot(a, g0);
-    const double mixed =
-        dot(p0, p1) * dot(g0, g1) + dot(p1, p2) * dot(g1, g2) + dot(p2, p0) * dot(g2, g0);
-    J.N[i] = perVolume * perVolume *
-             (norm2(p0) * norm2(g0) + norm2(p1) * norm2(g1) + norm2(p2) * norm2(g2) + 2 * mixed);
+    J.N[i] = norm2(g0.x * p0 + g1.x * p1 + g2.x * p2) + norm2(g0.y * p0 + g1.y * p1 + g2.y * p2) +
+             norm2(g0.z * p0 + g1.z * p1 + g2.z * p2);
     J.sigma[i] = perVolume * dot(p0, cross(p1, p2));
   }
   return J;
@@ -2149,7 +2159,7 @@ void forQualities(const Mesh& M, Ideal ideal, const Use& use) {
     const Distortions at = distortionsOf(J, 0, plainEta);
     for (int i = 0; i < count; ++i) {
       const int E = first + i;
-      const bool inRange = J.sigma[i] > leastH && J.sigma[i] < 1 / leastH;
+      const bool inRange = J.sigma[i] > leastH && J.sigma[i] < 1 / leastH && J.N[i] < 1 / leastH;
       use(inRange ? 1 / at.eta[i] : quality(jacobian(ideals.of(E), cornersOf(M.x, M.tets[E]))));
     }
   }
@@ -2181,6 +2191,7 @@ QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal) {
   });
   const double count = static_cast<double>(M.tets.size());
   table.mean /= count;
+  // in one pass, from 1: rounding leaves some 1e-8 where all q are equal
   const double fromMean = squares / count - (1 - table.mean) * (1 - table.mean);
   table.stdDev = std::sqrt(std::max(0., fromMean));
   return table;

@@ -413,11 +413,12 @@ TEST_SUITE("2") {
     const Mesh before = M;
     const std::vector<std::array<int, 4>> neighbour = bisection.neighbour;
     Dice dice(19);
-    for (int trial = 0; trial < 3; ++trial) {
-      bisection.beginTrial();
-      for (int i = 0; i < 100; ++i) bisection.bisect(dice.below(M.tets.size()));
-      CHECK(M.tets.size() > before.tets.size() + 100);
-      bisection.undoTrial();
+    for (int round = 0; round < 3; ++round) {
+      {
+        const Bisection::Trial trial(bisection);
+        for (int i = 0; i < 100; ++i) bisection.bisect(dice.below(M.tets.size()));
+        CHECK(M.tets.size() > before.tets.size() + 100);
+      }
       CHECK(shapes::sameMesh(M, before));
       CHECK(bisection.neighbour == neighbour);
       CHECK(bisection.tetOf.size() == M.x.size());

@@ -294,7 +294,7 @@ TEST_SUITE("3.5") {
     label(M, {1, 1, 1}, {2, 2, 1});
     Bisection B(M);
     CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 1, elementsAt(B.M, 1)));
-    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 2, elementsAt(B.M, 2)));  // no such surface
+    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 2, elementsAt(B.M, 1)));  // no such surface
   }
 
   TEST_CASE("case 4: a face of S_M with two edges on the rim") {

@@ -68,6 +68,21 @@ TEST_SUITE("Table I") {
     }
   }
 
+  TEST_CASE("Table I: departure, flat ideal elements, and both of extreme scale") {
+    for (double scale : {1., 1e53, 1e-53, 1e-60})
+      for (double height : {1., 1e-5, 1e-9, 1e-11}) {
+        Mesh M;
+        M.xi = {{0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {.3, .3, height}};
+        for (Vec3& p : M.xi) {
+          p = scale * p;
+          M.x.push_back({p.y, p.z, p.x});
+        }
+        M.tets = {{0, 1, 2, 3}};
+        CHECK(qualities(M)[0] == doctest::Approx(1).epsilon(1e-4 * 1e-11 / height + 1e-13));
+        CHECK(qualityStatistics(M).inverted == 0);
+      }
+  }
+
   TEST_CASE("Table I: min, max, mean, standard deviation, histogram") {
     Mesh M = shapes::unsymmetricStar();
     const std::vector<double> q = qualities(M);
