@@ -234,8 +234,8 @@ struct OptimizeReport {
   int sweeps = 0;           // of all phases; a sweep visits the nodes whose stars have moved
   std::int64_t visits = 0;  // of nodes, in all sweeps
   double disp = 0;          // of Algorithm 2's last sweep (before the worst elements), as maxDisp
-  // valid and disp <= maxDisp (where the worst elements are lifted next: its root mean square <= 2
-  // maxDisp) before maxSweeps
+  // valid and disp <= maxDisp (where the worst elements are lifted next: its root mean square <=
+  // 2.5 maxDisp) before maxSweeps
   bool converged = false;
   int inverted = 0;  // elements with σ <= 0 left
   double minQ = 0, meanQ = 0;
@@ -980,6 +980,9 @@ Star starOf(const Mesh& M, int n, const std::vector<int>& around);
 /// [§3.7.2, eq. (9)] f(x) = Σ_j η_j^power over the star, with analytic gradient and Hessian.
 double f(const Star& star, Vec3 x, double delta, double power = 1);
 Objective fDerivatives(const Star& star, Vec3 x, double delta, double power = 1);
+/// [§3.7.4 departure] Whether d, if it is at most 1.7 Newton steps from the origin, meets the first
+/// Wolfe condition for certain (δ = 0, power 1): no element changes its curvature much on the way.
+bool isSmallStep(const Star& star, Vec3 d);
 /// [§3.7.3, eq. (10)] f_ϕ(u) = f ∘ ϕ(u); ∞ where u is outside 𝓤.
 double fVarphi(const Star& star, const Parametrization& P, Vec2 u, double delta, double power = 1);
 /// [§3.7.3, eq. (11)] f_γ(s) = f ∘ γ(s).

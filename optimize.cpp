@@ -27,6 +27,16 @@
 
 #include "meccano.hpp"
 
+// Compiled by g++ twice, for every x86-64 and for AVX2: the program takes what the machine has.
+// Both give the same bytes, for no operation is reordered or contracted. (The choice is made before
+// the thread sanitizer starts, which would crash in it.)
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && \
+    !defined(__SANITIZE_THREAD__)
+#define MECCANO_AVX2_TOO [[gnu::target_clones("avx2", "default")]]
+#else
+#define MECCANO_AVX2_TOO
+#endif
+
 namespace meccano {
 namespace {
 
@@ -156,10 +166,21 @@ double sumOf(const Lanes& a) {
   return sum;
 }
 
-/// Elements of a star side by side: the fields of StarElement.
+/// Elements of a star side by side. In one struct, so that compilers see that what is written is
+/// not what is read.
 struct StarBlock {
-  Lanes N, sigma, gg, vx, vy, vz, sx, sy, sz;
+  Lanes ax, ay, az, bx, by, bz, cx, cy, cz;           // edges a, b, c from the node
+  Lanes K01, K02, K03, K12, K13, K23, perVolume, gg;  // the fields of IdealCorner
+  Lanes N, sigma, vx, vy, vz, sx, sy, sz;             // and with gg those of StarElement
 
+  void set(int i, const IdealCorner& k, Vec3 a, Vec3 b, Vec3 c) {
+    ax[i] = a.x, ay[i] = a.y, az[i] = a.z;
+    bx[i] = b.x, by[i] = b.y, bz[i] = b.z;
+    cx[i] = c.x, cy[i] = c.y, cz[i] = c.z;
+    K01[i] = k.K01, K02[i] = k.K02, K03[i] = k.K03;
+    K12[i] = k.K12, K13[i] = k.K13, K23[i] = k.K23;
+    perVolume[i] = k.perVolume, gg[i] = k.gg;
+  }
   void set(int i, const StarElement& e) {
     N[i] = e.N, sigma[i] = e.sigma, gg[i] = e.gg;
     vx[i] = e.v.x, vy[i] = e.v.y, vz[i] = e.v.z;
@@ -174,46 +195,19 @@ struct StarBlock {
   }
 };
 
-/// Elements side by side: edges a, b, c from the node, the fields of IdealCorner; the edges at the
-/// node.
-struct CornerBlock {
-  Lanes ax, ay, az, bx, by, bz, cx, cy, cz;
-  Lanes K01, K02, K03, K12, K13, K23, perVolume, gg;
-
-  void set(int i, const IdealCorner& k, Vec3 a, Vec3 b, Vec3 c) {
-    ax[i] = a.x, ay[i] = a.y, az[i] = a.z;
-    bx[i] = b.x, by[i] = b.y, bz[i] = b.z;
-    cx[i] = c.x, cy[i] = c.y, cz[i] = c.z;
-    K01[i] = k.K01, K02[i] = k.K02, K03[i] = k.K03;
-    K12[i] = k.K12, K13[i] = k.K13, K23[i] = k.K23;
-    perVolume[i] = k.perVolume, gg[i] = k.gg;
-  }
-};
-
-struct ClosedForm {
-  StarBlock star;
-  Lanes shortest, longest;  // of the edges at the node, squared
-};
-
-ClosedForm closedForm(const CornerBlock& in) {
-  ClosedForm out;
-  StarBlock& star = out.star;
+/// N, σ, v, s from the edges and the ideal elements.
+MECCANO_AVX2_TOO void closedForm(StarBlock& e) {
   for (int i = 0; i < lanes; ++i) {
-    const Vec3 a{in.ax[i], in.ay[i], in.az[i]}, b{in.bx[i], in.by[i], in.bz[i]};
-    const Vec3 c{in.cx[i], in.cy[i], in.cz[i]}, ab = b - a, ac = c - a, bc = c - b;
-    const double aa = norm2(a), bb = norm2(b), cc = norm2(c);
-    const Vec3 v = -(in.K01[i] * a + in.K02[i] * b + in.K03[i] * c);
-    const Vec3 s = -in.perVolume[i] * cross(ab, ac);
-    star.N[i] = in.K01[i] * aa + in.K02[i] * bb + in.K03[i] * cc + in.K12[i] * norm2(ab) +
-                in.K13[i] * norm2(ac) + in.K23[i] * norm2(bc);
-    star.sigma[i] = -dot(a, s);
-    star.gg[i] = in.gg[i];
-    star.vx[i] = v.x, star.vy[i] = v.y, star.vz[i] = v.z;
-    star.sx[i] = s.x, star.sy[i] = s.y, star.sz[i] = s.z;
-    out.shortest[i] = std::min(aa, std::min(bb, cc));
-    out.longest[i] = std::max(aa, std::max(bb, cc));
+    const Vec3 a{e.ax[i], e.ay[i], e.az[i]}, b{e.bx[i], e.by[i], e.bz[i]};
+    const Vec3 c{e.cx[i], e.cy[i], e.cz[i]}, ab = b - a, ac = c - a, bc = c - b;
+    const Vec3 v = -(e.K01[i] * a + e.K02[i] * b + e.K03[i] * c);
+    const Vec3 s = -e.perVolume[i] * cross(ab, ac);
+    e.N[i] = e.K01[i] * norm2(a) + e.K02[i] * norm2(b) + e.K03[i] * norm2(c) +
+             e.K12[i] * norm2(ab) + e.K13[i] * norm2(ac) + e.K23[i] * norm2(bc);
+    e.sigma[i] = -dot(a, s);
+    e.vx[i] = v.x, e.vy[i] = v.y, e.vz[i] = v.z;
+    e.sx[i] = s.x, e.sy[i] = s.y, e.sz[i] = s.z;
   }
-  return out;
 }
 
 struct Penalty {
@@ -313,8 +307,8 @@ using StarBlocks = std::vector<StarBlock>;
 /// [§3.7.2, eq. (9)] Σ φ(η) over a star, its gradient and its Hessian.
 ///   leastSlope  bound of σ/R from below. 2/3 makes each term positive definite
 ///   source      derivatives after [32]
-Objective objectiveOf(const StarBlocks& star, double delta, const Penalty& P,
-                      double leastSlope = -1) {
+MECCANO_AVX2_TOO Objective objectiveOf(const StarBlocks& star, double delta, const Penalty& P,
+                                       double leastSlope = -1) {
   Lanes f{}, gx{}, gy{}, gz{}, xx{}, xy{}, xz{}, yy{}, yz{}, zz{};
   for (const StarBlock& block : star) {
     const Distortions at = distortionsOf(block, delta, P);
@@ -342,7 +336,7 @@ Objective objectiveOf(const StarBlocks& star, double delta, const Penalty& P,
 }
 
 /// Σ φ(η) with the node displaced by d.
-double valueAt(const StarBlocks& star, Vec3 d, double delta, const Penalty& P) {
+MECCANO_AVX2_TOO double valueAt(const StarBlocks& star, Vec3 d, double delta, const Penalty& P) {
   Lanes f{};
   const double dd = norm2(d);
   for (const StarBlock& block : star) {
@@ -359,6 +353,23 @@ double valueAt(const StarBlocks& star, Vec3 d, double delta, const Penalty& P) {
     for (int i = 0; i < lanes; ++i) f[i] += at.phi[i];
   }
   return sumOf(f);
+}
+
+/// isSmallStep(). With u = s·d/σ and w = |g||d|/√N, η becomes η (1 + 2βw + w²)/(1 + u)^⅔, |β| <= 1.
+/// For |u|, w <= .15, and all β, what is left of it after η + ∇η·d is at most 1.16/2 dᵀ Hess η d.
+/// Summed, with Newton's direction p and d = t p: f(d) − f <= (t − .58 t²) ∇f·p.
+MECCANO_AVX2_TOO bool allSmall(const StarBlocks& star, Vec3 d) {
+  constexpr double small = .15;
+  Lanes above{};
+  const double dd = norm2(d);
+  for (const StarBlock& e : star)
+    for (int i = 0; i < lanes; ++i) {
+      const double sd = e.sx[i] * d.x + e.sy[i] * d.y + e.sz[i] * d.z;
+      const double onSigma = std::abs(sd) - small * e.sigma[i];
+      const double onN = e.gg[i] * dd - small * small * e.N[i];
+      above[i] = std::max(above[i], std::max(onSigma, onN));
+    }
+  return sumOf(above) <= 0;
 }
 
 /// The star with the node displaced by d.
@@ -389,9 +400,10 @@ Star starOf(const Mesh& M, int n, const std::vector<int>& around) {
     const auto k = std::find(tet.begin(), tet.end(), n) - tet.begin();
     const int* o = opposite[k];
     const Vec3 a = M.x[tet[o[0]]] - M.x[n], b = M.x[tet[o[1]]] - M.x[n];
-    CornerBlock in{};
-    in.set(0, idealCorner(ideals.of(E), k), a, b, M.x[tet[o[2]]] - M.x[n]);
-    star.elements.push_back(closedForm(in).star.element(0));
+    StarBlock block{};
+    block.set(0, idealCorner(ideals.of(E), k), a, b, M.x[tet[o[2]]] - M.x[n]);
+    closedForm(block);
+    star.elements.push_back(block.element(0));
   }
   return star;
 }
@@ -403,6 +415,8 @@ double f(const Star& star, Vec3 x, double delta, double power) {
 Objective fDerivatives(const Star& star, Vec3 x, double delta, double power) {
   return objectiveOf(displaced(blocksOf(star), x - star.origin), delta, {0, 1, power});
 }
+
+bool isSmallStep(const Star& star, Vec3 d) { return allSmall(blocksOf(star), d); }
 
 // ==== 3.7.3 Objective function for surface and edge nodes =======================================
 
@@ -547,6 +561,7 @@ double armijoSearch(const Function& F, LinePoint atZero, double t) {
 struct Direction {
   Vec3 p;
   double slope, tMax;
+  bool newton;
 };
 
 constexpr double definiteSlope = 2. / 3;  // σ/R from which an element's Hessian is definite
@@ -557,10 +572,10 @@ template <class Derivatives>
 Direction descentDirection(const Objective& o, const Derivatives& derivatives, const Mat3& D,
                            double edge) {
   Vec3 p;
-  if (!solveCholesky(o.hessian, -o.gradient, p) &&
-      !solveCholesky(derivatives(definiteSlope).hessian, -o.gradient, p))
+  const bool newton = solveCholesky(o.hessian, -o.gradient, p);
+  if (!newton && !solveCholesky(derivatives(definiteSlope).hessian, -o.gradient, p))
     p = (-.1 * edge / norm(D * o.gradient)) * o.gradient;
-  return {p, dot(p, o.gradient), edge / norm(D * p)};
+  return {p, dot(p, o.gradient), edge / norm(D * p), newton};
 }
 
 }  // namespace
@@ -702,10 +717,16 @@ Sum sumOfPieces(Crew& crew, int begin, int end, int size, const Task& task) {
   return sum;
 }
 
-/// An element of a node's star: the other three nodes, the index of its IdealCorner.
+/// An element of a node's star: the places of the other three nodes among its neighbours, the index
+/// of its IdealCorner.
 struct StarEntry {
-  int a, b, c, corner;
+  std::uint16_t a, b, c;
+  int corner;
 };
+
+/// [choice] Elements at a node that moves, at most: no node has as many but the hub of a fan. Its
+/// neighbours fit into 16 bits.
+constexpr int mostElements = 20000;
 
 /// A surface triangle of a sliding node, the node first, counter-clockwise in 𝓤 of its surface.
 struct SheetTriangle {
@@ -729,6 +750,8 @@ struct Smoother {
   std::vector<int> colourStart = {};  // [colours + 1] rows of each colour
   std::vector<int> starStart = {};    // [rows + 1] of row r: star[starStart[r] .. starStart[r + 1])
   std::vector<StarEntry> star = {};   // the elements at free nodes
+  std::vector<int> nearStart = {};    // [rows + 1] of row r: near[nearStart[r] .. nearStart[r + 1])
+  std::vector<int> near = {};         // the neighbours of free nodes
   std::vector<int> sheetStart = {};   // [nodes + 1] surface triangles at n, rows of sheet
   std::vector<SheetTriangle> sheet = {};
 
@@ -873,10 +896,12 @@ void buildElements(Smoother& S) {
 struct Incidence {
   std::vector<int> start, item;
 };
-Incidence tetsAtFreeNodes(const Smoother& S) {
+Incidence tetsAtFreeNodes(Smoother& S) {
   Incidence at{std::vector<int>(S.M.x.size() + 1, 0), {}};
   for (int E : S.elements)
     for (int n : S.M.tets[E]) at.start[n + 1] += S.freedom[n] > 0;
+  for (std::size_t n = 0; n < S.M.x.size(); ++n)
+    if (at.start[n + 1] > mostElements) S.freedom[n] = 0, at.start[n + 1] = 0;
   std::partial_sum(at.start.begin(), at.start.end(), at.start.begin());
   std::vector<int> next(at.start.begin(), at.start.end() - 1);
   at.item.resize(at.start.back());
@@ -908,9 +933,8 @@ std::vector<int> colourNodes(const Smoother& S, const Incidence& at) {
 
 constexpr int piece = 4096;  // elements or rows of a light task
 
-/// The rows: free nodes by colour, each with its star.
-void buildStars(Smoother& S) {
-  const Incidence at = tetsAtFreeNodes(S);
+/// The rows: free nodes by colour.
+void buildRows(Smoother& S, const Incidence& at) {
   const std::vector<int> colour = colourNodes(S, at);
   for (std::size_t n = 0; n < colour.size(); ++n)
     if (colour[n] >= 0) S.order.push_back(static_cast<int>(n));
@@ -927,19 +951,44 @@ void buildStars(Smoother& S) {
   }
   S.colourStart.push_back(static_cast<int>(S.order.size()));
   S.edge.assign(S.order.size(), 0);
+}
+
+/// The star of each row, and its neighbours in the order in which the star names them.
+void fillStars(Smoother& S, const Incidence& at) {
+  const int rows = static_cast<int>(S.order.size());
   S.star.resize(at.item.size());
-  forPieces(S.crew, 0, static_cast<int>(S.order.size()), piece, [&](int, int from, int to) {
+  S.nearStart.assign(rows + 1, 0);
+  std::vector<std::vector<int>> nearOf(rows / piece + 1);
+  forPieces(S.crew, 0, rows, piece, [&](int number, int from, int to) {
+    std::vector<int>& near = nearOf[number];
     for (int row = from; row < to; ++row) {
       const int n = S.order[row];
+      const std::ptrdiff_t first = static_cast<std::ptrdiff_t>(near.size());
+      const auto place = [&](int i) {
+        const std::ptrdiff_t k = std::find(near.begin() + first, near.end(), i) - near.begin();
+        if (k == static_cast<std::ptrdiff_t>(near.size())) near.push_back(i);
+        return static_cast<std::uint16_t>(k - first);
+      };
       StarEntry* entry = &S.star[S.starStart[row]];
       for (int j = at.start[n]; j < at.start[n + 1]; ++j, ++entry) {
         const std::array<int, 4>& tet = S.M.tets[at.item[j]];
         const int k = static_cast<int>(std::find(tet.begin(), tet.end(), n) - tet.begin());
         const int* o = opposite[k];
-        *entry = {tet[o[0]], tet[o[1]], tet[o[2]], 4 * S.shapeOf[at.item[j]] + k};
+        entry->a = place(tet[o[0]]), entry->b = place(tet[o[1]]), entry->c = place(tet[o[2]]);
+        entry->corner = 4 * S.shapeOf[at.item[j]] + k;
       }
+      S.nearStart[row + 1] = static_cast<int>(near.size()) - static_cast<int>(first);
     }
   });
+  std::partial_sum(S.nearStart.begin(), S.nearStart.end(), S.nearStart.begin());
+  S.near.reserve(S.nearStart.back());
+  for (const std::vector<int>& near : nearOf) S.near.insert(S.near.end(), near.begin(), near.end());
+}
+
+void buildStars(Smoother& S) {
+  const Incidence at = tetsAtFreeNodes(S);
+  buildRows(S, at);
+  fillStars(S, at);
 }
 
 struct SheetFace {
@@ -1104,13 +1153,14 @@ std::vector<double> qualitiesOf(const Smoother& S, const std::vector<int>& eleme
   std::vector<double> q(elements.size());
   const auto ofPiece = [&](int, int from, int to) {
     for (int k = from; k < to; k += lanes) {
-      CornerBlock in{};
+      StarBlock block{};
       for (int i = 0; i < std::min(lanes, to - k); ++i) {
         const int E = elements[k + i];
         const std::array<Vec3, 4> x = cornersOf(S.M.x, S.M.tets[E]);
-        in.set(i, S.corners[4 * S.shapeOf[E]], x[1] - x[0], x[2] - x[0], x[3] - x[0]);
+        block.set(i, S.corners[4 * S.shapeOf[E]], x[1] - x[0], x[2] - x[0], x[3] - x[0]);
       }
-      const Distortions at = distortionsOf(closedForm(in).star, 0, plainEta);
+      closedForm(block);
+      const Distortions at = distortionsOf(block, 0, plainEta);
       for (int i = 0; i < std::min(lanes, to - k); ++i) q[k + i] = 1 / at.eta[i];
     }
   };
@@ -1126,8 +1176,8 @@ struct Edges {
 
 /// The star under visit; kept to save allocations.
 struct Visit {
-  int count = 0;  // of elements
-  std::vector<CornerBlock> corners = {};
+  int count = 0;                 // of elements
+  std::vector<Vec3> edges = {};  // to the neighbours
   StarBlocks star = {};
   double delta = 0;
 };
@@ -1136,28 +1186,37 @@ struct Visit {
 /// the scalar stores it reads would wait for them.
 Edges gatherStar(const Smoother& S, int row, Visit& visit) {
   const Vec3 x = S.M.x[S.order[row]];
+  double shortest = unbounded, longest = 0;
+  visit.edges.clear();
+  for (int k = S.nearStart[row]; k < S.nearStart[row + 1]; ++k) {
+    const Vec3 edge = S.M.x[S.near[k]] - x;
+    shortest = std::min(shortest, norm2(edge));
+    longest = std::max(longest, norm2(edge));
+    visit.edges.push_back(edge);
+  }
   const int begin = S.starStart[row], count = S.starStart[row + 1] - begin;
   const int blocks = (count + lanes - 1) / lanes;
   visit.count = count;
-  visit.corners.resize(blocks);
   visit.star.resize(blocks);
   for (int j = 0; j < lanes * blocks; ++j) {
     const StarEntry& e = S.star[begin + std::min(j, count - 1)];
-    visit.corners[j / lanes].set(j % lanes, S.corners[e.corner], S.M.x[e.a] - x, S.M.x[e.b] - x,
-                                 S.M.x[e.c] - x);
+    visit.star[j / lanes].set(j % lanes, S.corners[e.corner], visit.edges[e.a], visit.edges[e.b],
+                              visit.edges[e.c]);
   }
-  double shortest = unbounded, longest = 0;
-  for (int k = 0; k < blocks; ++k) {
-    const ClosedForm form = closedForm(visit.corners[k]);
-    visit.star[k] = form.star;
-    shortest = std::min(shortest, *std::min_element(form.shortest, form.shortest + lanes));
-    longest = std::max(longest, *std::max_element(form.longest, form.longest + lanes));
-  }
+  for (StarBlock& block : visit.star) closedForm(block);
   visit.star.back().clearFrom(count - lanes * (blocks - 1));
   return {std::sqrt(shortest), std::sqrt(longest)};
 }
 
 constexpr double roundingOfF = 1e-14;  // relative: a smaller decrease of f is lost in its sum
+
+constexpr double mostNewtonSteps = 1.7;  // (t − .58 t²) > c1 t
+
+/// [departure] Whether t meets the first Wolfe condition for certain: f is not tried then.
+bool isSure(const Smoother& S, const Visit& visit, const Direction& d, double t) {
+  return d.newton && t <= mostNewtonSteps && visit.delta == 0 && S.penalty.scale == 0 &&
+         allSmall(visit.star, t * d.p);
+}
 
 /// [§3.7.4] An inner node: one Newton step. Returns the displacement.
 double visitInner(Smoother& S, int n, const Visit& visit, const Edges& edges) {
@@ -1175,9 +1234,11 @@ double visitInner(Smoother& S, int n, const Visit& visit, const Edges& edges) {
     return LinePoint{at.f, dot(at.gradient, d.p)};
   };
   const LinePoint atZero{o.f, d.slope};
-  const double t = S.options.strongWolfe
-                       ? wolfeSearch(line, atZero, S.relaxation, d.tMax).t
-                       : armijoSearch(value, atZero, std::min(S.relaxation, d.tMax));
+  double t = std::min(S.relaxation, d.tMax);
+  if (S.options.strongWolfe)
+    t = wolfeSearch(line, atZero, S.relaxation, d.tMax).t;
+  else if (!isSure(S, visit, d, t))
+    t = armijoSearch(value, atZero, t);
   S.M.x[n] += t * d.p;
   return t * norm(d.p);
 }
@@ -1352,8 +1413,7 @@ void countSweep(Smoother& S, double disp) {
 void wakeNode(Smoother& S, int n) { S.awake[n].store(1, std::memory_order_relaxed); }
 
 void wakeNeighbours(Smoother& S, int row) {
-  for (int k = S.starStart[row]; k < S.starStart[row + 1]; ++k)
-    for (int i : {S.star[k].a, S.star[k].b, S.star[k].c}) wakeNode(S, i);
+  for (int k = S.nearStart[row]; k < S.nearStart[row + 1]; ++k) wakeNode(S, S.near[k]);
 }
 
 /// Visits nodes of one colour, given by their rows. Returns the largest displacement.
@@ -1779,7 +1839,7 @@ constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is no
 /// [departure] where the worst elements are lifted afterwards, which smooths all others too: so
 /// much of it, and the sweeps end where the root mean square of the displacements is as small. To
 /// sweep on until no node moves took 2 to 10 times the visits for the same qualities in the end.
-constexpr double settledFraction = 2;
+constexpr double settledFraction = 2.5;
 constexpr int sweepsWithoutProgress = 3;       // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
@@ -1850,17 +1910,17 @@ bool untangleAndSmooth(Smoother& S) {
 
 constexpr double worstFraction = .004;  // of the elements count as the worst ones,
 constexpr std::size_t worstCount = 10;  // but at least so many
-constexpr int liftRounds = 25, liftSweeps = 4, lastSweeps = 8;
-constexpr double liftMeanLoss =
-    .015;  // of mean q: the rounds end there (the last one wins most back),
-constexpr double liftMinGain = .002;  // or where the lowest q rises by less
-constexpr double perfect = .9995;     // a lowest q that is not lifted
-constexpr int idleRounds = 2;         // in so many rounds
-constexpr double lowQuality = .45;    // below it the lift has patience:
+constexpr int liftRounds = 40;          // each a sweep
+constexpr double liftMeanLoss = .015;  // of mean q: the rounds end there (the last sweeps win back)
+constexpr double liftMinGain = .002;   // or where the lowest q rises by less
+constexpr double perfect = .9995;      // a lowest q that is not lifted
+constexpr int idleRounds = 2;          // in so many rounds
+constexpr double lowQuality = .45;     // below it the lift has patience:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
-constexpr double liftMaxDisp = 1e-3;  // relative to the shortest edge: a round's sweeps end there
-constexpr double liftWake = .05;      // unrest for a visit: only what happens near the worst counts
-constexpr double lastWake = .01;      // and in the last round, that of the mean
+constexpr double liftWake = .05;  // unrest for a visit: only what happens near the worst counts
+constexpr int lastSweeps = 5;
+constexpr double lastWake = .01;      // unrest in the last sweeps, and the displacement relative to
+constexpr double lastMaxDisp = 1e-3;  // the shortest edge where they end
 constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
                                    // an element's nodes are not visited again
 /// η_w at least: of η of the worst. 1.3^64 = 2e7: these outweigh all others; with less of them the
@@ -1917,11 +1977,11 @@ void updateWorst(Smoother& S, WorstElements& worst) {
   worst.mean = std::accumulate(worst.q.begin(), worst.q.end(), 0.) / count;
 }
 
-/// One round: sweeps on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes on at whose elements the
-/// second term has changed since the last round. By how much: with the larger and the smaller q_w
-/// of the two rounds, |Δ| = (larger/q)^power c, c = 1 − (smaller/larger)^power. So |Δ| > liftReach
-/// where q < larger (c/liftReach)^(1/power).
-void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, double wake) {
+/// The next sweeps are on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes on at whose elements the
+/// second term has changed since the last ones. By how much: with the larger and the smaller of
+/// both q_w, |Δ| = (larger/q)^power c, c = 1 − (smaller/larger)^power. So |Δ| > liftReach where q <
+/// larger (c/liftReach)^(1/power).
+void aimLift(Smoother& S, const WorstElements& worst, double qw, double wake) {
   const double power = S.options.power, larger = std::max(qw, S.penalty.scale);
   const double c = 1 - std::pow(std::min(qw, S.penalty.scale) / larger, power);
   const double reach = larger * std::pow(c / liftReach, 1 / power);
@@ -1931,14 +1991,12 @@ void liftRound(Smoother& S, const WorstElements& worst, double qw, int sweeps, d
   for (std::size_t i = 0; i < worst.q.size(); ++i)
     if (worst.q[i] < reach)
       for (int n : S.M.tets[worst.element[i]]) wakeNode(S, n);
-  for (int k = 0; k < sweeps && sweepsLeft(S); ++k)
-    if (sweepNodes(S) <= liftMaxDisp) return;
 }
 
 /// [§3.7.4 departure] Raises the worst elements of a valid, settled mesh: Σ η + (η/η_w)^power, with
-/// η_w the distortion that the worst .4 % exceed, anew in each round; the others keep Σ η. Ends
-/// where the lowest q rises no more. A last round with η_w that of the worst element lets all the
-/// others relax and wins the mean back.
+/// η_w the distortion that the worst .4 % exceed, anew for each sweep; the others keep Σ η. Ends
+/// where the lowest q rises no more. Last sweeps with η_w that of the worst element let all the
+/// others relax and win the mean back.
 void liftWorst(Smoother& S) {
   WorstElements worst = reachedElements(S);
   updateWorst(S, worst);
@@ -1949,14 +2007,17 @@ void liftWorst(Smoother& S) {
     const bool low = worst.lowest < lowQuality;
     if (round >= (low ? patientRounds : liftRounds)) break;
     if (idle >= (low ? patientIdleRounds : idleRounds)) break;
-    liftRound(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftSweeps, liftWake);
+    aimLift(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftWake);
+    sweepNodes(S);
     updateWorst(S, worst);
     if (worst.mean < meanAtStart - liftMeanLoss) break;
     const bool rises = worst.lowest >= highest + liftMinGain;
     idle = rises ? 0 : idle + 1;
     if (rises) highest = worst.lowest;
   }
-  liftRound(S, worst, worst.lowest, lastSweeps, lastWake);
+  aimLift(S, worst, worst.lowest, lastWake);
+  for (int k = 0; k < lastSweeps && sweepsLeft(S); ++k)
+    if (sweepNodes(S) <= lastMaxDisp) return;
 }
 
 // ---- input -------------------------------------------------------------------------------------

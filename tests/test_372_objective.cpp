@@ -3,6 +3,7 @@
 // §3.7.2: the objective function of a node and its analytic derivatives.
 #include <doctest/doctest.h>
 
+#include "../samples/surfaces.hpp"
 #include "shapes.hpp"
 
 using namespace meccano;
@@ -24,6 +25,18 @@ double slowF(Mesh M, Vec3 x, double delta, double power,
     sum += std::pow(etaRegularized(J, delta), power);
   }
   return sum;
+}
+
+Vec3 randomVector(samples::Random& random) {
+  return {random.between(-1, 1), random.between(-1, 1), random.between(-1, 1)};
+}
+
+/// Any N, σ, g, v, s that an element may have: |v| <= |g| √N.
+StarElement randomElement(samples::Random& random) {
+  const double N = random.between(3, 30), gg = random.between(.1, 10);
+  const Vec3 v = randomVector(random);
+  const double part = std::min(1., random.between(0, 2)) * std::sqrt(gg * N / dot(v, v));
+  return {N, random.between(.1, 1), gg, part * v, random.between(0, 5) * randomVector(random)};
 }
 
 /// Orders of the Taylor remainders of f, without and with the Hessian, from step to step/2.
@@ -119,6 +132,49 @@ TEST_SUITE("3.7.2") {
                    (f(star, x + Vec3{0, 0, e}, .2) - f(star, x - Vec3{0, 0, e}, .2)) / (2 * e)};
       CHECK(norm(g - o.gradient) < 1e-7 * norm(g));
     }
+  }
+
+  TEST_CASE("isSmallStep: what Taylor's series leaves out is at most 1.16/2 of the second term") {
+    samples::Random random(7);
+    int small = 0;
+    for (int k = 0; k < 20000; ++k) {
+      const StarElement e = randomElement(random);
+      const Star star{{}, {e}};
+      const Vec3 d = randomVector(random);
+      const double u = std::abs(dot(e.s, d)) / e.sigma, w = std::sqrt(e.gg * dot(d, d) / e.N);
+      const Vec3 to = (random.between(.01, .2) / std::max(u, w)) * d;
+      const double larger = std::max(u, w) * std::sqrt(dot(to, to) / dot(d, d));
+      CHECK(isSmallStep(star, to) == (larger <= .15));
+      if (!isSmallStep(star, to)) continue;
+      ++small;
+      const Objective o = fDerivatives(star, {}, 0);
+      const double rest = f(star, to, 0) - o.f - dot(o.gradient, to);
+      CHECK(rest <= .58 * dot(to, o.hessian * to) + 1e-14 * o.f);
+    }
+    CHECK(small > 1000);
+  }
+
+  TEST_CASE("isSmallStep: 1.7 Newton steps meet the first Wolfe condition") {
+    samples::Random random(8);
+    int small = 0;
+    for (int k = 0; k < 2000; ++k) {
+      Star star;
+      for (int i = 0; i < 5; ++i) {  // pairs nearly in balance, so that the Newton step is short
+        StarElement e = randomElement(random);
+        star.elements.push_back(e);
+        e.v = -1 * e.v + .05 * randomVector(random), e.s = -1 * e.s;
+        star.elements.push_back(e);
+      }
+      const Objective o = fDerivatives(star, {}, 0);
+      Vec3 p;
+      if (!solveCholesky(o.hessian, -o.gradient, p)) continue;
+      for (double t : {1., 1.5, 1.7}) {
+        if (!isSmallStep(star, t * p)) continue;
+        ++small;
+        CHECK(f(star, t * p, 0) <= o.f + 1e-4 * t * dot(o.gradient, p));
+      }
+    }
+    CHECK(small > 1000);
   }
 
   TEST_CASE("eq. (9): the Hessian of a valid star is positive definite at delta = 0") {
