@@ -1840,6 +1840,10 @@ constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is no
 /// much of it, and the sweeps end where the root mean square of the displacements is as small. To
 /// sweep on until no node moves took 2 to 10 times the visits for the same qualities in the end.
 constexpr double settledFraction = 2.5;
+/// [departure] The same while elements of a whole mesh are inverted: what moves less has no part in
+/// the tangle. All are visited again once it is valid. A fifth of the visits of a surface projected
+/// far. Not around given active nodes, which are near, nor with a δ of each star, as of no use.
+constexpr double tangledWake = .1;
 constexpr int sweepsWithoutProgress = 3;       // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
@@ -1871,6 +1875,15 @@ struct MuSchedule {
   }
 };
 
+/// For δ may have changed where nothing has moved.
+void wakeInverted(Smoother& S) {
+  forPieces(S.crew, 0, static_cast<int>(S.elements.size()), piece, [&](int, int from, int to) {
+    for (int i = from; i < to; ++i)
+      if (!(sigmaOf(S, S.elements[i]) > 0))
+        for (int n : S.M.tets[S.elements[i]]) wakeNode(S, n);
+  });
+}
+
 /// [§3.7.4, Algorithm 2] optimizeMesh's loop. While elements are inverted δ comes from the σ_min of
 /// all elements that may change and holds for all nodes; afterwards it is 0, and a move that would
 /// invert an element has f = ∞. Returns whether it converged on a valid mesh.
@@ -1878,7 +1891,9 @@ bool untangleAndSmooth(Smoother& S) {
   MuSchedule schedule;
   bool tangled = true;
   const double settled = S.options.power > 1 ? settledFraction * S.options.maxDisp : 0;
-  S.wake = std::max(wakeFraction * S.options.maxDisp, settled);
+  const double wake = std::max(wakeFraction * S.options.maxDisp, settled);
+  const OptimizeOptions& o = S.options;
+  const bool isWhole = o.acceleration > 0 && o.active.empty() && !o.starDelta;
   Anderson acceleration(S);
   while (sweepsLeft(S)) {
     const Validity v = tangled ? validity(S) : Validity{0, 1};
@@ -1891,6 +1906,10 @@ bool untangleAndSmooth(Smoother& S) {
       for (int n : S.order) wakeNode(S, n);
       continue;
     }
+    if (isWhole && tangled) wakeInverted(S);
+    if (isWhole && S.tangled && !tangled)
+      for (int n : S.order) wakeNode(S, n);
+    S.wake = tangled && isWhole ? tangledWake : wake;
     S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted)) : 0;
     S.tangled = tangled;
     S.stuck = tangled && schedule.tangledSweeps > easySweeps;

@@ -235,6 +235,18 @@ TEST_SUITE("3.7.4") {
     }
   }
 
+  TEST_CASE("Algorithm 2: departure, while a mesh is tangled what moves little is not visited") {
+    const auto visitsOf = [](int acceleration) {
+      OptimizeOptions options;
+      options.maxSweeps = 5, options.acceleration = acceleration;
+      Mesh M = turnedCube(24, 10, 14, 2.2, options.fixed);
+      const OptimizeReport report = optimizeMesh(M, options);
+      CHECK(report.inverted > 0);
+      return static_cast<double>(report.visits);
+    };
+    CHECK(visitsOf(4) < .9 * visitsOf(0));  // sweeps are mixed from the first valid one on
+  }
+
   TEST_CASE(
       "Algorithm 2: without the descent a hopeless mesh is given up after ten sweeps, others are "
       "not") {
