@@ -2061,25 +2061,24 @@ void readMeditSection(Scanner& in, const std::string& key, MeshFile& file,
                      key.compare(0, 7, "Pyramid") == 0 || key.compare(0, 12, "TetrahedraP2") == 0;
   if (solid)
     in.failHere(key.substr(0, 40) + " are in it; only tetrahedra of four nodes can be treated");
-  int count =
-      key == "Vertices" || key == "Tetrahedra" || key == "Triangles" || key == "RequiredVertices"
-          ? in.count("entries of a section")
-          : 0;
-  for (; count > 0; --count) {
-    if (key == "RequiredVertices") {
+  const bool vertices = key == "Vertices", tetrahedra = key == "Tetrahedra";
+  const bool triangles = key == "Triangles", required = key == "RequiredVertices";
+  const bool isRead = vertices || tetrahedra || triangles || required;
+  for (int count = isRead ? in.count("entries of a section") : 0; count > 0; --count) {
+    if (required) {
       file.required.push_back(meditNode(in, M));
       continue;
     }
-    if (key == "Vertices") {
+    if (vertices) {
       M.x.push_back(readPoint(in));
     } else {
       const int a = meditNode(in, M), b = meditNode(in, M), c = meditNode(in, M);
-      if (key == "Triangles") faces.push_back({{a, b, c}, 0});
-      if (key == "Tetrahedra") addTetrahedron(M, {a, b, c, meditNode(in, M)}, in);
+      if (triangles) faces.push_back({{a, b, c}, 0});
+      if (tetrahedra) addTetrahedron(M, {a, b, c, meditNode(in, M)}, in);
     }
     const int reference = in.number<int>("a reference");
-    if (key == "Tetrahedra") regions.insert(reference);
-    if (key == "Triangles") faces.back().tag = reference;
+    if (tetrahedra) regions.insert(reference);
+    if (triangles) faces.back().tag = reference;
   }
 }
 
@@ -3568,13 +3567,12 @@ void runOptimize(const Arguments& a, const Streams& io) {
                       " elements are still inverted after " + std::to_string(r.sweeps) +
                       " sweeps, nothing was written; raise --max-sweeps, or the boundary does not "
                       "allow a valid mesh");
-  const QualityStatistics smoothed = qualityStatistics(M);
   const bool ideal = !M.xi.empty();
   const QualityStatistics regular = qualityStatistics(M, Ideal::regular);
   if (!meccano) M.xi.clear();
   writeFiles({{path, meshText(path, M, file.required)}});
   progress.line(path + ": " + sizeOf(M));
-  io.out << tableI({{"original", &original}, {"smoothed", &smoothed}});
+  io.out << tableI({{"original", &original}, {"smoothed", &r.quality}});
   if (ideal) io.out << regularLine(regular);
   io.out << r.sweeps << " sweeps, displacement " << format("%.3g", r.disp)
          << (r.converged ? ", converged\n" : ", stopped by --max-sweeps\n");
