@@ -216,7 +216,8 @@ struct OptimizeOptions {
   // Threads that share a sweep, 0: all cores; the result is the same for every number. 1 here,
   // for a host has threads of its own; the program takes all cores.
   int threads = 1;
-  // [§3.7.4 departure] sweeps that Anderson's acceleration mixes; [0, 8], 0: none
+  // [§3.7.4 departure] sweeps that Anderson's acceleration mixes; [0, 8], 0: none, and every move
+  // wakes the neighbours while the mesh is tangled
   int acceleration = 4;
   std::vector<int> fixed = {};  // nodes that stay where they are, besides the corners
   // nodes visited in the first sweep: only these and nodes up to four edges away move; empty: all
@@ -981,7 +982,8 @@ Star starOf(const Mesh& M, int n, const std::vector<int>& around);
 double f(const Star& star, Vec3 x, double delta, double power = 1);
 Objective fDerivatives(const Star& star, Vec3 x, double delta, double power = 1);
 /// [§3.7.4 departure] Whether d, if it is at most 1.7 Newton steps from the origin, meets the first
-/// Wolfe condition for certain (δ = 0, power 1): no element changes its curvature much on the way.
+/// Wolfe condition for certain (δ = 0, power 1), up to rounding: no element changes its curvature
+/// much on the way. false where d or an element is no number, or σ <= 0.
 bool isSmallStep(const Star& star, Vec3 d);
 /// [§3.7.3, eq. (10)] f_ϕ(u) = f ∘ ϕ(u); ∞ where u is outside 𝓤.
 double fVarphi(const Star& star, const Parametrization& P, Vec2 u, double delta, double power = 1);
@@ -1004,7 +1006,7 @@ WolfeStep strongWolfe(const std::function<LinePoint(double t)>& F, double tFirst
 /// [§3.7.4, Algorithm 2] Untangles and smooths M node by node; boundary, surface and curve nodes
 /// slide on their entities, corners stay. Works on any tetrahedral mesh: without M.xi the ideal
 /// elements are regular, without M.dimension the boundary is fixed. Indices and entities keep; M.x
-/// and M.parameter change.
+/// and M.parameter change. A node of more than 20000 elements stays.
 ///   errors  InputError: options out of range, a malformed mesh.
 ///           No exception for an unfinished optimization: see the report.
 OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options = {});

@@ -9,7 +9,7 @@
 //   4      Table I
 //
 // The time goes into smoothNode(): one pass over the elements of a star for f, its gradient and its
-// Hessian (a cube root each), one more for the trial step.
+// Hessian (a cube root each), one more for the trial step where one is needed.
 #include <atomic>
 #include <cfloat>
 #include <condition_variable>
@@ -28,9 +28,10 @@
 #include "meccano.hpp"
 
 // Compiled by g++ twice, for every x86-64 and for AVX2: the program takes what the machine has.
-// Both give the same bytes, for no operation is reordered or contracted. (The choice is made before
-// the thread sanitizer starts, which would crash in it.)
-#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && \
+// Both give the same bytes, for AVX2 has no fused operations and nothing is reordered. (The choice
+// is made before the thread sanitizer starts, which would crash in it.)
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__UCLIBC__) && defined(__GNUC__) && \
+    !defined(__clang__) && !defined(__INTEL_COMPILER) && !defined(__NVCOMPILER) &&            \
     !defined(__SANITIZE_THREAD__)
 #define MECCANO_AVX2_TOO [[gnu::target_clones("avx2", "default")]]
 #else
@@ -365,11 +366,12 @@ MECCANO_AVX2_TOO bool allSmall(const StarBlocks& star, Vec3 d) {
   for (const StarBlock& e : star)
     for (int i = 0; i < lanes; ++i) {
       const double sd = e.sx[i] * d.x + e.sy[i] * d.y + e.sz[i] * d.z;
-      const double onSigma = std::abs(sd) - small * e.sigma[i];
-      const double onN = e.gg[i] * dd - small * small * e.N[i];
-      above[i] = std::max(above[i], std::max(onSigma, onN));
+      const double onSigma = small * e.sigma[i] - std::abs(sd);
+      const double onN = small * small * e.N[i] - e.gg[i] * dd;
+      const bool isIn = (onSigma >= 0) & (onN >= 0) & (e.sigma[i] > 0);  // false for no number
+      above[i] += isIn ? 0 : 1;
     }
-  return sumOf(above) <= 0;
+  return sumOf(above) == 0;
 }
 
 /// The star with the node displaced by d.
@@ -964,9 +966,14 @@ void fillStars(Smoother& S, const Incidence& at) {
     for (int row = from; row < to; ++row) {
       const int n = S.order[row];
       const std::ptrdiff_t first = static_cast<std::ptrdiff_t>(near.size());
+      const bool isHub = at.start[n + 1] - at.start[n] > 100;
+      std::map<int, std::ptrdiff_t> ofHub;  // its neighbours are too many to look through
       const auto place = [&](int i) {
-        const std::ptrdiff_t k = std::find(near.begin() + first, near.end(), i) - near.begin();
-        if (k == static_cast<std::ptrdiff_t>(near.size())) near.push_back(i);
+        const std::ptrdiff_t end = static_cast<std::ptrdiff_t>(near.size());
+        const std::ptrdiff_t k =
+            isHub ? ofHub.emplace(i, end).first->second
+                  : std::find(near.begin() + first, near.end(), i) - near.begin();
+        if (k == end) near.push_back(i);
         return static_cast<std::uint16_t>(k - first);
       };
       StarEntry* entry = &S.star[S.starStart[row]];
@@ -1840,9 +1847,11 @@ constexpr double wakeFraction = .1;  // of maxDisp: a star that moved less is no
 /// much of it, and the sweeps end where the root mean square of the displacements is as small. To
 /// sweep on until no node moves took 2 to 10 times the visits for the same qualities in the end.
 constexpr double settledFraction = 2.5;
-/// [departure] The same while elements of a whole mesh are inverted: what moves less has no part in
-/// the tangle. All are visited again once it is valid. A fifth of the visits of a surface projected
-/// far. Not around given active nodes, which are near, nor with a δ of each star, as of no use.
+/// [departure] Displacement, relative to the shortest edge, that wakes the neighbours while a whole
+/// mesh is tangled; nodes of inverted elements are always visited, and all once the mesh is valid.
+/// Saves a fifth of the visits of a surface projected far. A heuristic: what it might leave tangled
+/// the global descent untangles. Not around active nodes, which are near, nor with a δ of each
+/// star.
 constexpr double tangledWake = .1;
 constexpr int sweepsWithoutProgress = 3;       // that μ is given before the next
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
@@ -1893,7 +1902,7 @@ bool untangleAndSmooth(Smoother& S) {
   const double settled = S.options.power > 1 ? settledFraction * S.options.maxDisp : 0;
   const double wake = std::max(wakeFraction * S.options.maxDisp, settled);
   const OptimizeOptions& o = S.options;
-  const bool isWhole = o.acceleration > 0 && o.active.empty() && !o.starDelta;
+  const bool wakesLess = o.acceleration > 0 && o.active.empty() && !o.starDelta;
   Anderson acceleration(S);
   while (sweepsLeft(S)) {
     const Validity v = tangled ? validity(S) : Validity{0, 1};
@@ -1906,10 +1915,10 @@ bool untangleAndSmooth(Smoother& S) {
       for (int n : S.order) wakeNode(S, n);
       continue;
     }
-    if (isWhole && tangled) wakeInverted(S);
-    if (isWhole && S.tangled && !tangled)
+    if (wakesLess && tangled) wakeInverted(S);
+    if (wakesLess && S.tangled && !tangled)
       for (int n : S.order) wakeNode(S, n);
-    S.wake = tangled && isWhole ? tangledWake : wake;
+    S.wake = tangled && wakesLess ? tangledWake : wake;
     S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted)) : 0;
     S.tangled = tangled;
     S.stuck = tangled && schedule.tangledSweeps > easySweeps;

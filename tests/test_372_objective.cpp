@@ -154,6 +154,18 @@ TEST_SUITE("3.7.2") {
     CHECK(small > 1000);
   }
 
+  TEST_CASE("isSmallStep: nothing is certain of flat, inverted or undefined elements and steps") {
+    const double none = std::numeric_limits<double>::quiet_NaN();
+    const auto isSmall = [](double sigma, Vec3 d) {
+      return isSmallStep({{}, {{3, sigma, 1, {0, 0, .1}, {.1, 0, 0}}}}, d);
+    };
+    CHECK(isSmall(1, {.01, .01, .01}));
+    CHECK_FALSE(isSmall(0, {0, .01, .01}));
+    CHECK_FALSE(isSmall(-1, {0, 0, 0}));
+    CHECK_FALSE(isSmall(none, {.01, .01, .01}));
+    CHECK_FALSE(isSmall(1, {none, 0, 0}));
+  }
+
   TEST_CASE("isSmallStep: 1.7 Newton steps meet the first Wolfe condition") {
     samples::Random random(8);
     int small = 0;
