@@ -356,7 +356,8 @@ MECCANO_AVX2_TOO double valueAt(const StarBlocks& star, Vec3 d, double delta, co
   return sumOf(f);
 }
 
-/// isSmallStep(). With u = s·d/σ and w = |g||d|/√N, η becomes η (1 + 2βw + w²)/(1 + u)^⅔, |β| <= 1.
+/// isSmallStep(). With u = s·d/σ and w = |g||d|/√N, |β| <= 1, η becomes
+///   η (1 + 2βw + w²)/(1 + u)^⅔.
 /// For |u|, w <= .15, and all β, what is left of it after η + ∇η·d is at most 1.16/2 dᵀ Hess η d.
 /// Summed, with Newton's direction p and d = t p: f(d) − f <= (t − .58 t²) ∇f·p.
 MECCANO_AVX2_TOO bool allSmall(const StarBlocks& star, Vec3 d) {
