@@ -6982,7 +6982,7 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
   constexpr int maxRounds = 8;
   constexpr int patientSweeps = 150;  // while tangled, of a loosened mesh: few elements are left
   constexpr std::size_t few = 60;
-  constexpr double poorQuality = .45;  // below it the worst are loosened: those below
+  constexpr double poorQuality = .55;  // below it the worst are loosened: those below
   constexpr double factors[] = {1.1, 1.3, 1.7, 2.2};  // of the lowest q, in turn while it stays
   OptimizeOptions optimize = I.options.optimize;
   optimize.globalDescent = false;

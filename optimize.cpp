@@ -1942,12 +1942,13 @@ constexpr std::size_t worstCount = 10;  // but at least so many
 constexpr int liftRounds = 40;          // each a sweep
 constexpr double liftMeanLoss = .015;  // of mean q: the rounds end there (the last sweeps win back)
 constexpr double liftMinGain = .002;   // or where the lowest q rises by less
+constexpr int idleRounds = 2;          // in so many rounds,
+constexpr double liftStill = .0005;    // or at once where q_w rises by less too
 constexpr double perfect = .9995;      // a lowest q that is not lifted
-constexpr int idleRounds = 2;          // in so many rounds
 constexpr double lowQuality = .45;     // below it the lift has patience:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
 constexpr double liftWake = .05;  // unrest for a visit: only what happens near the worst counts
-constexpr int lastSweeps = 5;
+constexpr int lastSweeps = 4;
 constexpr double lastWake = .01;      // unrest in the last sweeps, and the displacement relative to
 constexpr double lastMaxDisp = 1e-3;  // the shortest edge where they end
 constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
@@ -2036,10 +2037,12 @@ void liftWorst(Smoother& S) {
     const bool low = worst.lowest < lowQuality;
     if (round >= (low ? patientRounds : liftRounds)) break;
     if (idle >= (low ? patientIdleRounds : idleRounds)) break;
-    aimLift(S, worst, std::min(worst.bound, liftRatio * worst.lowest), liftWake);
+    const double bound = worst.bound, lowest = worst.lowest;
+    aimLift(S, worst, std::min(bound, liftRatio * lowest), liftWake);
     sweepNodes(S);
     updateWorst(S, worst);
     if (worst.mean < meanAtStart - liftMeanLoss) break;
+    if (worst.bound < bound + liftStill && worst.lowest < lowest + liftStill) break;
     const bool rises = worst.lowest >= highest + liftMinGain;
     idle = rises ? 0 : idle + 1;
     if (rises) highest = worst.lowest;
