@@ -2143,24 +2143,32 @@ void Bisection::ring(int E, int a, int b, std::vector<int>& around) const {
   }
 }
 
-void Bisection::star(int n, std::vector<int>& around) const {
+template <class Wanted>
+int Bisection::walkStar(int n, std::vector<int>& around, const Wanted& wanted) const {
+  walkedBy.resize(M.tets.size(), 0);
+  ++walk;
   around.assign(1, tetOf[n]);
+  walkedBy[tetOf[n]] = walk;
   for (std::size_t i = 0; i < around.size(); ++i) {
     const int t = around[i];
+    if (wanted(t)) return t;
     for (int j = 0; j < 4; ++j) {
       const int next = neighbour[t][j];
-      if (M.tets[t][j] == n || next < 0) continue;
-      if (std::find(around.begin(), around.end(), next) == around.end()) around.push_back(next);
+      if (M.tets[t][j] == n || next < 0 || walkedBy[next] == walk) continue;
+      walkedBy[next] = walk;
+      around.push_back(next);
     }
   }
+  return -1;
+}
+
+void Bisection::star(int n, std::vector<int>& around) const {
+  walkStar(n, around, [](int) { return false; });
 }
 
 int Bisection::tetWithEdge(int a, int b) const {
   std::vector<int> around;
-  star(a, around);
-  for (int t : around)
-    if (localIndex(M.tets[t], b) >= 0) return t;
-  return -1;
+  return walkStar(a, around, [&](int t) { return localIndex(M.tets[t], b) >= 0; });
 }
 
 bool parameterOn(const Mesh& M, int n, int label, Vec2& u) {

@@ -434,6 +434,12 @@ struct Bisection {
   std::size_t undoNodes = 0;
   int undoTets = -1;  // -1: no trial
 
+  mutable std::vector<int> walkedBy;  // [tets] the last walk that came by
+  mutable int walk = 0;
+
+  /// The star of n, face by face, up to the first tetrahedron that is wanted: returns it, or -1.
+  template <class Wanted>
+  int walkStar(int n, std::vector<int>& around, const Wanted& wanted) const;
   int addMidpoint(int a, int b, const std::vector<int>& around);
   void keepForUndo(int E);
   void undo();
