@@ -1943,7 +1943,7 @@ constexpr int liftRounds = 40;          // each a sweep
 constexpr double liftMeanLoss = .015;  // of mean q: the rounds end there (the last sweeps win back)
 constexpr double liftMinGain = .002;   // or where the lowest q rises by less
 constexpr int idleRounds = 2;          // in so many rounds,
-constexpr double liftStill = .0005;    // or at once where q_w rises by less too
+constexpr double liftStill = .001;     // or at once where q_w rises by less too
 constexpr double perfect = .9995;      // a lowest q that is not lifted
 constexpr double lowQuality = .45;     // below it the lift has patience:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
@@ -2042,7 +2042,8 @@ void liftWorst(Smoother& S) {
     sweepNodes(S);
     updateWorst(S, worst);
     if (worst.mean < meanAtStart - liftMeanLoss) break;
-    if (worst.bound < bound + liftStill && worst.lowest < lowest + liftStill) break;
+    const bool still = worst.bound < bound + liftStill && worst.lowest < lowest + liftStill;
+    if (still && !low) break;
     const bool rises = worst.lowest >= highest + liftMinGain;
     idle = rises ? 0 : idle + 1;
     if (rises) highest = worst.lowest;
