@@ -7181,13 +7181,13 @@ std::vector<std::array<int, 3>> farFaces(const Mesh& M, const SurfaceDistance& S
 }
 
 /// [departure] Where S_M passes over a pit of S, or a fin, that is narrower than the cubes, so that
-/// it would be refused: the edges of its faces there are bisected, and the mesh is smoothed again,
-/// as long as the distance falls. Finer cubes there alone, that is.
+/// it would be warned of or refused: the edges of its faces there are bisected, and the mesh is
+/// smoothed again, as long as the distance falls. Finer cubes there alone, that is.
 void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
   constexpr int maxRounds = 6;
   constexpr double wanted = .25;  // [choice] of l_c: with room to what is warned of
   const double lc = report.lc;
-  if (report.hausdorff <= badHausdorff * lc) return;
+  if (report.hausdorff <= poorHausdorff * lc) return;
   for (int round = 0; round < maxRounds && report.hausdorff > wanted * lc; ++round) {
     Mesh trial = M;
     Bisection B(trial);
