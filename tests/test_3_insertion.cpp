@@ -689,7 +689,9 @@ TEST_SUITE("3") {
     try {
       const InsertReport report = insertSurface(M, S, options);
       checkPromises(before, M, S, 1, report, 1e-12 * shapes::diagonal(S));
-      CHECK_FALSE(report.warnings.empty());  // poor at the least
+      CAPTURE(report.hausdorff / report.lc);
+      CAPTURE(report.smoothed.min);
+      CHECK((report.hausdorff <= .3 * report.lc || !report.warnings.empty()));  // poor is told
     } catch (const MethodError& error) {
       CHECK(has(error.what(), "no valid mesh at l_c"));
       CHECK(shapes::sameMesh(M, before));
