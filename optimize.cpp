@@ -1943,7 +1943,7 @@ constexpr int liftRounds = 40;          // each a sweep
 constexpr double liftMeanLoss = .015;  // of mean q: the rounds end there (the last sweeps win back)
 constexpr double liftMinGain = .002;   // or where the lowest q rises by less
 constexpr int idleRounds = 2;          // in so many rounds,
-constexpr double liftStill = .001;     // or at once where q_w rises by less too
+constexpr double liftStill = .001;     // or at once where neither it nor q_w rises by this
 constexpr double perfect = .9995;      // a lowest q that is not lifted
 constexpr double lowQuality = .45;     // below it the lift has patience:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
