@@ -129,6 +129,27 @@ TEST_SUITE("4.2") {
     }
   }
 
+  TEST_CASE("sets: a surface that lowers q is smoothed once more together with the earlier ones") {
+    const auto tilted = [](Vec3 c, double half, double bend, double tilt) {
+      return samples::sheet(8, 8, [=](double s, double t) {
+        return c + Vec3{half * s, half * t, tilt * s + bend * s * t + .5 * bend * s * s};
+      });
+    };
+    Mesh M = box();
+    InsertOptions options;
+    options.lc = .1;
+    insertSurface(M, tilted({.5, .5, .4}, .3, .05, .05), options);
+    bool together = false;
+    options.onProgress = [&together](const std::string& line) {
+      together = together || has(line, "all nodes once more");
+    };
+    const InsertReport report = insertSurface(M, tilted({.5, .5, .58}, .2, .02, .2), options);
+    CHECK(together);
+    CHECK(report.smoothed.min >= .6);  // .577 by the nodes near S alone
+    CHECK(report.smoothed.min == qualityStatistics(M).min);
+    CHECK(report.hausdorff <= .3 * report.lc);
+  }
+
   TEST_CASE("sets: a surface between two near ones lowers l_c by itself, and says why") {
     const std::vector<TriangleSurface> S{sheetAt({.5, .5, .44}, .2, 0, "below"),
                                          sheetAt({.5, .5, .48}, .2, 0, "above"),
