@@ -24,6 +24,7 @@
 #include <cmath>
 #include <cstdint>
 #include <functional>
+#include <memory>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -103,6 +104,31 @@ inline Mat3 cofactor(const Mat3& A) {
 inline Mat3 inverse(const Mat3& A) { return (1 / det(A)) * transpose(cofactor(A)); }
 /// Solves A p = b for symmetric A by Cholesky; false where A is not positive definite.
 bool solveCholesky(const Mat3& A, Vec3 b, Vec3& p);
+
+// ==== Tools: threads ============================================================================
+
+/// Threads that share the pieces of one loop after the other. They wait in between, for to start a
+/// thread takes longer than most pieces do.
+class Crew {
+ public:
+  /// Of so many threads, the caller's among them; 0: of all cores. They start with the first loop
+  /// that has several pieces.
+  explicit Crew(int threads = 1);
+  Crew(Crew&&) noexcept;
+  Crew& operator=(Crew&&) noexcept;
+  ~Crew();
+
+  /// task(k, from, to) for the pieces k of [begin, end), `size` long, which the threads take in
+  /// turn: whatever the tasks do may not depend on who does it and when. No task shares a loop of
+  /// its own in the same crew.
+  ///   errors  what a task throws ends the loop; of several the lowest piece's is thrown again
+  using Task = std::function<void(int k, int from, int to)>;
+  void forPieces(int begin, int end, int size, const Task& task) const;
+
+ private:
+  struct Threads;
+  std::unique_ptr<Threads> threads_;
+};
 
 // ==== Data ======================================================================================
 

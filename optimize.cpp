@@ -606,115 +606,124 @@ WolfeStep strongWolfe(const std::function<LinePoint(double t)>& F, double tFirst
   return wolfeSearch(F, F(0), tFirst, tMax);
 }
 
-// ==== 3.7.4 Optimization approach: Algorithm 2 ==================================================
+// ==== Tools: threads ============================================================================
 
-namespace {
-
-/// Threads that share one job after the other. They wait in between, for to start a thread takes
-/// longer than to visit the nodes of most colours.
-class Crew {
- public:
-  Crew() = default;
-  Crew(const Crew&) = delete;
-  Crew& operator=(const Crew&) = delete;
-  ~Crew();
-  /// Of so many threads, the caller's among them.
-  void hire(int threads);
+struct Crew::Threads {
+  explicit Threads(int threads) : wanted(threads) {}
+  ~Threads();
+  void start();
+  void serve();
   /// job() here and in those of the others that come before it ends here.
   void run(const std::function<void()>& job);
 
- private:
-  void serve();
-
-  std::vector<std::thread> others_;
-  std::mutex mutex_;
-  std::condition_variable start_, end_;
-  const std::function<void()>* job_ = nullptr;  // null: none; guarded by mutex_, as what follows
-  int inside_ = 0;                              // others at the job
-  bool leaves_ = false;
-  std::atomic<unsigned> round_{0};  // of jobs
+  const int wanted;  // the caller's among them
+  std::vector<std::thread> others;
+  std::mutex mutex;
+  std::condition_variable begin, end;
+  const std::function<void()>* job = nullptr;  // null: none; guarded by mutex, as what follows
+  int inside = 0;                              // others at the job
+  bool leaves = false;
+  std::atomic<unsigned> round{0};  // of jobs
 };
 
-Crew::~Crew() {
+Crew::Threads::~Threads() {
   {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    leaves_ = true;
-    ++round_;
+    const std::lock_guard<std::mutex> lock(mutex);
+    leaves = true;
+    ++round;
   }
-  start_.notify_all();
-  for (std::thread& other : others_) other.join();
+  begin.notify_all();
+  for (std::thread& other : others) other.join();
 }
 
-void Crew::hire(int threads) {
+void Crew::Threads::start() {
   try {
-    for (int k = 1; k < threads; ++k) others_.emplace_back([this] { serve(); });
+    for (int k = 1; k < wanted; ++k) others.emplace_back([this] { serve(); });
   } catch (const std::system_error&) {
     // no more threads to be had: those there are do it all
   }
 }
 
-void Crew::serve() {
+void Crew::Threads::serve() {
   constexpr int patience = 200;  // [choice] looks for a job before it sleeps: some 100 μs
   unsigned seen = 0;
   for (;;) {
-    for (int k = 0; k < patience && round_ == seen; ++k) std::this_thread::yield();
-    std::unique_lock<std::mutex> lock(mutex_);
-    start_.wait(lock, [&] { return round_ != seen; });
-    seen = round_;
-    if (leaves_) return;
-    if (job_ == nullptr) continue;
-    const std::function<void()>& job = *job_;
-    ++inside_;
+    for (int k = 0; k < patience && round == seen; ++k) std::this_thread::yield();
+    std::unique_lock<std::mutex> lock(mutex);
+    begin.wait(lock, [&] { return round != seen; });
+    seen = round;
+    if (leaves) return;
+    if (job == nullptr) continue;
+    const std::function<void()>& mine = *job;
+    ++inside;
     lock.unlock();
-    job();
+    mine();
     lock.lock();
-    if (--inside_ == 0) end_.notify_one();
+    if (--inside == 0) end.notify_one();
   }
 }
 
-void Crew::run(const std::function<void()>& job) {
+void Crew::Threads::run(const std::function<void()>& shared) {
+  if (others.empty()) start();
   {
-    const std::lock_guard<std::mutex> lock(mutex_);
-    job_ = &job;
-    ++round_;
+    const std::lock_guard<std::mutex> lock(mutex);
+    job = &shared;
+    ++round;
   }
-  start_.notify_all();
-  job();
-  std::unique_lock<std::mutex> lock(mutex_);
-  job_ = nullptr;
-  end_.wait(lock, [this] { return inside_ == 0; });
+  begin.notify_all();
+  shared();
+  std::unique_lock<std::mutex> lock(mutex);
+  job = nullptr;
+  end.wait(lock, [this] { return inside == 0; });
 }
 
-/// task(k, from, to) for the pieces k of [begin, end), which the crew takes in turn: whatever the
-/// tasks do may not depend on who does it and when. An exception ends all and is thrown again here.
-template <class Task>
-void forPieces(Crew& crew, int begin, int end, int size, const Task& task) {
+namespace {
+
+int coresOr(int threads) {
+  const int cores = static_cast<int>(std::thread::hardware_concurrency());
+  return threads > 0 ? threads : std::max(1, cores);
+}
+
+}  // namespace
+
+Crew::Crew(int threads) : threads_(std::make_unique<Threads>(coresOr(threads))) {}
+Crew::Crew(Crew&&) noexcept = default;
+Crew& Crew::operator=(Crew&&) noexcept = default;
+Crew::~Crew() = default;
+
+void Crew::forPieces(int begin, int end, int size, const Task& task) const {
   const int pieces = (end - begin + size - 1) / size;
   std::atomic<int> next{0};
   std::mutex mutex;
   std::exception_ptr failure;
+  int failed = pieces;
   const auto work = [&] {
+    int k = 0;
     try {
-      for (int k = next++; k < pieces; k = next++)
+      for (k = next++; k < pieces; k = next++)
         task(k, begin + k * size, std::min(end, begin + (k + 1) * size));
     } catch (...) {
       next = pieces;
       const std::lock_guard<std::mutex> lock(mutex);
-      failure = std::current_exception();
+      if (k < failed) failed = k, failure = std::current_exception();
     }
   };
-  if (pieces > 1)
-    crew.run(work);
+  if (pieces > 1 && threads_->wanted > 1)
+    threads_->run(work);
   else
     work();
   if (failure) std::rethrow_exception(failure);
 }
 
+// ==== 3.7.4 Optimization approach: Algorithm 2 ==================================================
+
+namespace {
+
 /// The sum of task(from, to) over the pieces, in their order.
 template <class Sum, class Task>
-Sum sumOfPieces(Crew& crew, int begin, int end, int size, const Task& task) {
+Sum sumOfPieces(const Crew& crew, int begin, int end, int size, const Task& task) {
   std::vector<Sum> parts((end - begin + size - 1) / size);
-  forPieces(crew, begin, end, size, [&](int k, int from, int to) { parts[k] = task(from, to); });
+  crew.forPieces(begin, end, size, [&](int k, int from, int to) { parts[k] = task(from, to); });
   Sum sum{};
   for (const Sum& part : parts) sum += part;
   return sum;
@@ -741,7 +750,7 @@ struct Smoother {
   Mesh& M;
   const OptimizeOptions& options;
   OptimizeReport report = {};
-  mutable Crew crew = {};
+  Crew crew = Crew();
 
   std::vector<int> elements = {};         // those that may change, ascending
   std::vector<IdealCorner> corners = {};  // 4 for each ideal element; few on a meccano mesh
@@ -962,7 +971,7 @@ void fillStars(Smoother& S, const Incidence& at) {
   S.star.resize(at.item.size());
   S.nearStart.assign(rows + 1, 0);
   std::vector<std::vector<int>> nearOf(rows / piece + 1);
-  forPieces(S.crew, 0, rows, piece, [&](int number, int from, int to) {
+  S.crew.forPieces(0, rows, piece, [&](int number, int from, int to) {
     std::vector<int>& near = nearOf[number];
     for (int row = from; row < to; ++row) {
       const int n = S.order[row];
@@ -993,12 +1002,6 @@ void fillStars(Smoother& S, const Incidence& at) {
   for (const std::vector<int>& near : nearOf) S.near.insert(S.near.end(), near.begin(), near.end());
 }
 
-void buildStars(Smoother& S) {
-  const Incidence at = tetsAtFreeNodes(S);
-  buildRows(S, at);
-  fillStars(S, at);
-}
-
 struct SheetFace {
   int label;
   std::array<int, 3> v;
@@ -1014,6 +1017,7 @@ std::array<int, 4> sheetKey(int label, std::array<int, 3> v) {
 /// The labelled faces of these elements, each once.
 std::vector<SheetFace> sheetFaces(const Mesh& M, const std::vector<int>& elements) {
   std::vector<SheetFace> faces;
+  if (M.faceLabel.empty() || M.dimension.empty()) return faces;
   for (int E : elements)
     for (int k = 0; k < 4; ++k) {
       SheetFace f{M.faceLabel[E][k], {}, 0, {}};
@@ -1103,15 +1107,13 @@ bool isBridge(const Mesh& M, const SheetFace& f) {
   return false;
 }
 
-/// The labelled faces at each sliding node, as triangles of 𝓤. Without bridges, which are not where
-/// 𝓤 has them: to keep them unfolded would only hold their nodes.
-void buildSheets(Smoother& S) {
+/// The triangles of 𝓤 at each sliding node, of these faces. Without bridges, which are not where 𝓤
+/// has them: to keep them unfolded would only hold their nodes.
+void fillSheets(Smoother& S, const std::vector<SheetFace>& faces) {
+  if (faces.empty()) return;
   const Mesh& M = S.M;
-  if (M.faceLabel.empty() || M.dimension.empty()) return;
-  std::vector<SheetFace> faces = sheetFaces(M, S.elements);
-  orientSheets(faces);
   std::vector<char> counts(faces.size(), 0);
-  forPieces(S.crew, 0, static_cast<int>(faces.size()), piece, [&](int, int from, int to) {
+  S.crew.forPieces(0, static_cast<int>(faces.size()), piece, [&](int, int from, int to) {
     for (int i = from; i < to; ++i) counts[i] = faces[i].area != 0 && !isBridge(M, faces[i]);
   });
   std::vector<std::pair<int, SheetTriangle>> entries;
@@ -1128,6 +1130,29 @@ void buildSheets(Smoother& S) {
   S.sheet.resize(entries.size());
   std::vector<int> next = S.sheetStart;
   for (const auto& entry : entries) S.sheet[next[entry.first]++] = entry.second;
+}
+
+/// As many threads as are wanted, and as have something to do.
+void hireCrew(Smoother& S) {
+  constexpr int elementsPerThread = 500;  // fewer are not worth one
+  const int useful = 1 + static_cast<int>(S.elements.size()) / elementsPerThread;
+  S.crew = Crew(S.options.accept ? 1 : std::min(coresOr(S.options.threads), useful));
+}
+
+/// All that is known of the elements before the first sweep.
+void build(Smoother& S) {
+  buildFreedom(S);
+  buildElements(S);
+  hireCrew(S);
+  Incidence at;
+  std::vector<SheetFace> faces;
+  S.crew.forPieces(0, 3, 1, [&](int part, int, int) {
+    if (part == 0) buildCorners(S);
+    if (part == 1) at = tetsAtFreeNodes(S), buildRows(S, at);
+    if (part == 2) faces = sheetFaces(S.M, S.elements), orientSheets(faces);
+  });
+  fillStars(S, at);
+  fillSheets(S, faces);
 }
 
 double sigmaOf(const Smoother& S, int E) {
@@ -1172,7 +1197,7 @@ std::vector<double> qualitiesOf(const Smoother& S, const std::vector<int>& eleme
       for (int i = 0; i < std::min(lanes, to - k); ++i) q[k + i] = 1 / at.eta[i];
     }
   };
-  forPieces(S.crew, 0, static_cast<int>(q.size()), piece, ofPiece);
+  S.crew.forPieces(0, static_cast<int>(q.size()), piece, ofPiece);
   return q;
 }
 
@@ -1453,7 +1478,7 @@ double sweepNodes(Smoother& S) {
     for (int row = S.colourStart[c]; row < S.colourStart[c + 1]; ++row)
       if (S.awake[S.order[row]].load(std::memory_order_relaxed)) rows.push_back(row);
     S.report.visits += static_cast<std::int64_t>(rows.size());
-    forPieces(S.crew, 0, static_cast<int>(rows.size()), rowsPerTask, [&](int k, int from, int to) {
+    S.crew.forPieces(0, static_cast<int>(rows.size()), rowsPerTask, [&](int k, int from, int to) {
       moved[k] = std::max(moved[k], visitRows(S, &rows[from], to - from));
     });
   }
@@ -1535,7 +1560,7 @@ class Anderson {
 
 std::vector<Vec3> Anderson::states() const {
   std::vector<Vec3> x(S.order.size());
-  forPieces(S.crew, 0, rows(), piece, [&](int, int from, int to) {
+  S.crew.forPieces(0, rows(), piece, [&](int, int from, int to) {
     for (int row = from; row < to; ++row) {
       const int n = S.order[row];
       if (S.freedom[n] == 3) x[row] = S.M.x[n];
@@ -1564,7 +1589,7 @@ std::array<float, 3> difference(Vec3 a, Vec3 b) {
 /// σ after the sweep.
 void Anderson::recordSigma() {
   sigma_.resize(S.elements.size());
-  forPieces(S.crew, 0, static_cast<int>(sigma_.size()), piece, [&](int, int from, int to) {
+  S.crew.forPieces(0, static_cast<int>(sigma_.size()), piece, [&](int, int from, int to) {
     for (int i = from; i < to; ++i) sigma_[i] = static_cast<float>(sigmaOf(S, S.elements[i]));
   });
 }
@@ -1576,7 +1601,7 @@ void Anderson::record() {
   const bool hasLast = recorded_ > 0;
   const int place = hasLast ? (recorded_ - 1) % memory() : 0;
   if (hasLast) dR_[place].resize(r_.size()), dG_[place].resize(r_.size());
-  forPieces(S.crew, 0, rows(), piece, [&](int, int from, int to) {
+  S.crew.forPieces(0, rows(), piece, [&](int, int from, int to) {
     for (int row = from; row < to; ++row) {
       r_[row] = difference(plain_[row], start_[row]);
       if (!hasLast) continue;
@@ -1611,7 +1636,7 @@ NormalEquations Anderson::normalEquations() const {
 /// Moves the nodes by −Σ γ_j ΔG_j, but for those that it would move too little to be visited.
 void Anderson::mix(const std::array<double, mostMixed>& gamma) {
   const int m = std::min(recorded_, memory());
-  forPieces(S.crew, 0, rows(), piece, [&](int, int from, int to) {
+  S.crew.forPieces(0, rows(), piece, [&](int, int from, int to) {
     for (int row = from; row < to; ++row) {
       Vec3 d;
       for (int j = 0; j < m; ++j)
@@ -1634,7 +1659,7 @@ constexpr double keptSigma = .5;
 bool Anderson::undoInvalid() {
   const int count = static_cast<int>(S.elements.size());
   std::vector<std::vector<int>> lost(count / piece + 1);
-  forPieces(S.crew, 0, count, piece, [&](int k, int from, int to) {
+  S.crew.forPieces(0, count, piece, [&](int k, int from, int to) {
     for (int i = from; i < to; ++i)
       if (!(sigmaOf(S, S.elements[i]) > keptSigma * sigma_[i])) lost[k].push_back(S.elements[i]);
   });
@@ -1887,7 +1912,7 @@ struct MuSchedule {
 
 /// For δ may have changed where nothing has moved.
 void wakeInverted(Smoother& S) {
-  forPieces(S.crew, 0, static_cast<int>(S.elements.size()), piece, [&](int, int from, int to) {
+  S.crew.forPieces(0, static_cast<int>(S.elements.size()), piece, [&](int, int from, int to) {
     for (int i = from; i < to; ++i)
       if (!(sigmaOf(S, S.elements[i]) > 0))
         for (int n : S.M.tets[S.elements[i]]) wakeNode(S, n);
@@ -1974,37 +1999,48 @@ WorstElements reachedElements(Smoother& S) {
   return worst;
 }
 
-/// The k-th lowest of q (k < q.size()), looked for below a guess first.
-double lowestOf(const std::vector<double>& q, std::size_t k, double guess) {
-  std::vector<double> low;
-  for (double value : q)
-    if (value <= guess) low.push_back(value);
-  if (low.size() <= k) low = q;
-  const auto at = low.begin() + static_cast<std::ptrdiff_t>(k);
-  std::nth_element(low.begin(), at, low.end());
-  return *at;
-}
+/// What is asked of all q: the lowest, the sum, and those up to a bound.
+struct LowQualities {
+  double lowest = unbounded, sum = 0;
+  std::vector<double> low = {};
+
+  void operator+=(const LowQualities& other) {
+    lowest = std::min(lowest, other.lowest);
+    sum += other.sum;
+    low.insert(low.end(), other.low.begin(), other.low.end());
+  }
+};
 
 /// Anew after sweeps: q of the elements at nodes that have moved since, and what follows from them.
 void updateWorst(Smoother& S, WorstElements& worst) {
+  constexpr double wide = 1.1;  // the bound rises little from one round to the next
   const int count = static_cast<int>(worst.q.size());
   if (count == 0) return;
-  const auto ofPiece = [&](int, int from, int to) {
+  const auto ofPiece = [&](int from, int to) {
     std::vector<int> places, elements;
     for (int i = from; i < to; ++i)
       if (isAtAny(S.moved, S.M.tets[worst.element[i]]))
         places.push_back(i), elements.push_back(worst.element[i]);
-    const std::vector<double> now = qualitiesOf(S, elements);  // one piece: no crew within a crew
+    const std::vector<double> now = qualitiesOf(S, elements);  // one piece: no loop within a loop
     for (std::size_t i = 0; i < places.size(); ++i) worst.q[places[i]] = now[i];
+    LowQualities part;
+    for (int i = from; i < to; ++i) {
+      part.lowest = std::min(part.lowest, worst.q[i]);
+      part.sum += worst.q[i];
+      if (worst.q[i] <= wide * worst.bound) part.low.push_back(worst.q[i]);
+    }
+    return part;
   };
-  forPieces(S.crew, 0, count, piece, ofPiece);
+  LowQualities all = sumOfPieces<LowQualities>(S.crew, 0, count, piece, ofPiece);
   S.moved.assign(S.moved.size(), 0);
-  constexpr double wide = 1.1;  // the bound rises little from one round to the next
   const std::size_t part = static_cast<std::size_t>(worstFraction * count);
   const std::size_t wanted = std::min(worst.q.size(), std::max(worstCount, part));
-  worst.bound = lowestOf(worst.q, wanted - 1, wide * worst.bound);
-  worst.lowest = *std::min_element(worst.q.begin(), worst.q.end());
-  worst.mean = std::accumulate(worst.q.begin(), worst.q.end(), 0.) / count;
+  if (all.low.size() < wanted) all.low = worst.q;
+  const auto last = all.low.begin() + static_cast<std::ptrdiff_t>(wanted - 1);
+  std::nth_element(all.low.begin(), last, all.low.end());
+  worst.bound = *last;
+  worst.lowest = all.lowest;
+  worst.mean = all.sum / count;
 }
 
 /// The next sweeps are on Σ η + (η/η_w)^power, q_w = 1/η_w, from the nodes on at whose elements the
@@ -2018,9 +2054,11 @@ void aimLift(Smoother& S, const WorstElements& worst, double qw, double wake) {
   S.penalty = {1, qw, power};
   S.relaxation = S.options.relaxation;
   S.wake = wake;
-  for (std::size_t i = 0; i < worst.q.size(); ++i)
-    if (worst.q[i] < reach)
-      for (int n : S.M.tets[worst.element[i]]) wakeNode(S, n);
+  S.crew.forPieces(0, static_cast<int>(worst.q.size()), piece, [&](int, int from, int to) {
+    for (int i = from; i < to; ++i)
+      if (worst.q[i] < reach)
+        for (int n : S.M.tets[worst.element[i]]) wakeNode(S, n);
+  });
 }
 
 /// [§3.7.4 departure] Raises the worst elements of a valid, settled mesh: Σ η + (η/η_w)^power, with
@@ -2159,19 +2197,6 @@ OptimizeOptions OptimizeOptions::paper() {
   return options;
 }
 
-namespace {
-
-/// As many threads as are wanted, and as have something to do.
-void hireCrew(Smoother& S) {
-  constexpr int elementsPerThread = 500;  // fewer are not worth one
-  const int cores = static_cast<int>(std::thread::hardware_concurrency());
-  const int wanted = S.options.threads > 0 ? S.options.threads : cores;
-  const int useful = 1 + static_cast<int>(S.elements.size()) / elementsPerThread;
-  S.crew.hire(S.options.accept ? 1 : std::min(wanted, useful));
-}
-
-}  // namespace
-
 OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   checkOptions(options, M.x.size());
   checkNodes(M);
@@ -2179,12 +2204,7 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options) {
   Smoother S{M, options};
   S.report.converged = true;
   if (M.tets.empty()) return S.report;
-  buildFreedom(S);
-  buildElements(S);
-  hireCrew(S);
-  buildCorners(S);
-  buildStars(S);
-  buildSheets(S);
+  build(S);
   S.awake = std::vector<std::atomic<unsigned char>>(M.x.size());
   S.reached.assign(M.x.size(), options.active.empty());
   S.moved.assign(M.x.size(), 0);
