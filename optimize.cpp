@@ -608,6 +608,8 @@ WolfeStep strongWolfe(const std::function<LinePoint(double t)>& F, double tFirst
 
 // ==== Tools: threads ============================================================================
 
+constexpr int patience = 200;  // [choice] looks before a thread sleeps: some 100 μs
+
 struct Crew::Threads {
   explicit Threads(int threads) : wanted(threads) {}
   ~Threads();
@@ -621,7 +623,7 @@ struct Crew::Threads {
   std::mutex mutex;
   std::condition_variable begin, end;
   const std::function<void()>* job = nullptr;  // null: none; guarded by mutex, as what follows
-  int inside = 0;                              // others at the job
+  std::atomic<int> inside{0};                  // others at the job
   bool leaves = false;
   std::atomic<unsigned> round{0};  // of jobs
 };
@@ -645,7 +647,6 @@ void Crew::Threads::start() {
 }
 
 void Crew::Threads::serve() {
-  constexpr int patience = 200;  // [choice] looks for a job before it sleeps: some 100 μs
   unsigned seen = 0;
   for (;;) {
     for (int k = 0; k < patience && round == seen; ++k) std::this_thread::yield();
@@ -672,8 +673,12 @@ void Crew::Threads::run(const std::function<void()>& shared) {
   }
   begin.notify_all();
   shared();
+  {
+    const std::lock_guard<std::mutex> lock(mutex);
+    job = nullptr;
+  }
+  for (int k = 0; k < patience && inside > 0; ++k) std::this_thread::yield();
   std::unique_lock<std::mutex> lock(mutex);
-  job = nullptr;
   end.wait(lock, [this] { return inside == 0; });
 }
 
@@ -1466,7 +1471,7 @@ double visitRows(Smoother& S, const int* rows, int count) {
   return disp;
 }
 
-constexpr int rowsPerTask = 64;  // some 70 μs
+constexpr int rowsPerTask = 32;  // some 30 μs
 
 /// [§3.7.4, Algorithm 2] The body of its while loop over the nodes whose star has moved: returns
 /// disp.
