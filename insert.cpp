@@ -3880,6 +3880,7 @@ int genusOf(const TriangleSurface& D) {
 namespace {
 
 constexpr double beyondAll = 1e300;  // beyond every coordinate; its square is infinite
+constexpr int queryPiece = 512;      // queries of a task for one thread: some 300 μs
 constexpr int trianglesPerLeaf = 4;
 /// Whether a box is farther than the bound, by more than rounding; a negative bound: always.
 bool isFarther(double distance2, double bound) {
@@ -4174,10 +4175,11 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
   return found;
 }
 
-/// Largest distance of points of A, a lattice of `least` steps on each triangle or of more that are
-/// no longer than `spacing`, from B, and the point, where it is above `largest`.
+/// Largest distance of points of the triangles [from, to) of A, in tree order, a lattice of `least`
+/// steps on each or of more that are no longer than `spacing`, from B, and the point, where it is
+/// above `largest`.
 Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
-                      Width largest = {0, {}}) {
+                      Width largest, int from, int to) {
   constexpr double mostSteps = 1000;
   // the triangles of B that were near last: neighbours in A are so to the same
   std::array<int, 4> recent{};
@@ -4195,7 +4197,8 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
     if (near >= 0) std::rotate(recent.begin(), recent.end() - 1, recent.end()), recent[0] = near;
     return near >= 0;
   };
-  for (const std::array<Vec3, 3>& c : A.corners) {
+  for (int t = from; t < to; ++t) {
+    const std::array<Vec3, 3>& c = A.corners[t];
     // the distance from one triangle is a convex function: on another one largest at a corner
     findNear((1. / 3) * (c[0] + c[1] + c[2]));
     const auto isNearOne = [&](Vec3 p) { return isNear(B, recent[0], p, largest.distance); };
@@ -4208,6 +4211,25 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
         if (!findNear(p)) largest = {B.closest(p).distance, p};
       }
   }
+  return largest;
+}
+
+/// The same over all triangles: from what a few of them tell, which spares most of the search.
+Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
+                      Width largest, const Crew& crew) {
+  constexpr int few = 32;
+  const int count = static_cast<int>(A.corners.size());
+  const auto keepLarger = [&largest](const Width& other) {
+    if (other.distance > largest.distance) largest = other;
+  };
+  for (int t = 0; t < count; t += std::max(1, count / few))
+    keepLarger(sampledDistance(A, B, least, spacing, largest, t, t + 1));
+  const Width start = largest;
+  std::vector<Width> ofPiece(count / queryPiece + 1, start);
+  crew.forPieces(0, count, queryPiece, [&](int k, int from, int to) {
+    ofPiece[k] = sampledDistance(A, B, least, spacing, start, from, to);
+  });
+  for (const Width& piece : ofPiece) keepLarger(piece);
   return largest;
 }
 
@@ -4237,16 +4259,23 @@ Gap smallestGap(const TriangleTree& tree, const std::vector<Vec3>& points,
   return gapWithin(tree, points, triangles, beyondAll);
 }
 
-std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& tree) {
+std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& tree,
+                                    const Crew& crew) {
+  const int count = static_cast<int>(S.triangles.size());
+  std::vector<std::vector<Crossing>> ofPiece(count / queryPiece + 1);
+  crew.forPieces(0, count, queryPiece, [&](int k, int from, int to) {
+    for (int t = from; t < to; ++t) {
+      const TriangleTree::Box box = boxOf(cornersOf(S, t));
+      tree.visit(box.lo, box.hi, [&](int s) {
+        Crossing found{t, s, {}};
+        if (s > t && trianglesCross(S, t, s, found.point)) ofPiece[k].push_back(found);
+        return false;
+      });
+    }
+  });
   std::vector<Crossing> crossings;
-  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) {
-    const TriangleTree::Box box = boxOf(cornersOf(S, t));
-    tree.visit(box.lo, box.hi, [&](int s) {
-      Crossing found{t, s, {}};
-      if (s > t && trianglesCross(S, t, s, found.point)) crossings.push_back(found);
-      return false;
-    });
-  }
+  for (const std::vector<Crossing>& found : ofPiece)
+    crossings.insert(crossings.end(), found.begin(), found.end());
   return crossings;
 }
 
@@ -4340,11 +4369,11 @@ Width rimWidth(const SurfaceDistance& S, double apart) {
 }
 
 Width farthestPoint(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
-                    double spacing) {
+                    double spacing, const Crew& crew) {
   if (A.nodes.empty() || B.nodes.empty() || samplesPerEdge < 1 || !(spacing > 0))
     throw InputError("hausdorffDistance: give two surfaces with triangles and samplesPerEdge >= 1");
-  const Width ofA = sampledDistance(A, B, samplesPerEdge, spacing);
-  return sampledDistance(B, A, samplesPerEdge, spacing, ofA);
+  const Width ofA = sampledDistance(A, B, samplesPerEdge, spacing, {0, {}}, crew);
+  return sampledDistance(B, A, samplesPerEdge, spacing, ofA, crew);
 }
 
 double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
@@ -4453,17 +4482,21 @@ enum class Cut : char { unknown, yes, no };
 
 /// Refines the tetrahedra cut by S that `wanted` asks for until there is none.
 template <class Wanted>
-void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, Wanted wanted) {
+void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, const Crew& crew,
+               Wanted wanted) {
   constexpr int maxPasses = 250;  // one level a pass; levels fit in a byte
   std::vector<int> changed(B.M.tets.size());
   std::iota(changed.begin(), changed.end(), 0);
   for (int pass = 0; pass < maxPasses; ++pass) {
     cut.resize(B.M.tets.size(), Cut::unknown);
+    crew.forPieces(0, static_cast<int>(changed.size()), queryPiece, [&](int, int from, int to) {
+      for (int i = from; i < to; ++i)
+        if (Cut& known = cut[changed[i]]; known == Cut::unknown)
+          known = meetsSurface(B.M, changed[i], S) ? Cut::yes : Cut::no;
+    });
     std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
-    for (int E : changed) {
-      if (cut[E] == Cut::unknown) cut[E] = meetsSurface(B.M, E, S) ? Cut::yes : Cut::no;
+    for (int E : changed)
       if (cut[E] == Cut::yes && wanted(E)) refine.push_back({E, B.M.level[E]});
-    }
     if (refine.empty()) return;
     B.splits.clear();
     for (const auto& [E, level] : refine)
@@ -4566,13 +4599,14 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
   return size;
 }
 
-Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc) {
+Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc,
+                                      const Crew& crew) {
   std::vector<Cut> cut;
-  refineCut(B, S, cut, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
+  refineCut(B, S, cut, crew, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
   Approximation A;
   A.level = cubeLevel(B.M, lc);
   // [choice] on to whole cubes, which §3.3 asks for: up to two bisections more than eq. (1)
-  refineCut(B, S, cut, [&](int E) { return B.M.level[E] < A.level; });
+  refineCut(B, S, cut, crew, [&](int E) { return B.M.level[E] < A.level; });
   A.T.resize(cut.size());
   for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E] == Cut::yes;
   return A;
@@ -4862,23 +4896,26 @@ std::vector<char> minimumCut(CubeGraph G) {
 /// What lies beyond the layer is on its own side, and so are the cubes that touch an earlier
 /// surface or the boundary: S_M must not pass there.
 CubeGraph graphOf(const Mesh& M, const Approximation& layer, const Cubes& cubes,
-                  const SurfaceDistance& S, double perDistance) {
+                  const SurfaceDistance& S, double perDistance, const Crew& crew) {
   constexpr CubeGraph::Weight perSquare = 1000, firm = 1000000 * perSquare;
   const Lattice lattice(layer.level);
   const double perH = 1 / cubeEdge(M, layer.level);
   CubeGraph G;
-  for (std::size_t c = 0; c < cubes.keys.size(); ++c) {
-    const SurfaceQuery at = S.query(cubes.centres[c]);
-    G.above.push_back(std::llround(perDistance * perSquare * perH * at.side));
-    G.next.emplace_back(), G.weight.emplace_back();
-    for (int d = 0; d < 6; ++d) {
-      std::array<std::int64_t, 3> beyond = Lattice::position(cubes.keys[c]);
-      beyond[d / 2] += d % 2 ? 2 : -2;
-      G.next[c][d] = cubes.number.get(Lattice::key(beyond)) - 1;
-      G.weight[c][d] = G.next[c][d] < 0 ? 0 : perSquare;
-      if (G.next[c][d] < 0 && !at.onRim) G.above[c] += at.side >= 0 ? perSquare : -perSquare;
+  const int count = static_cast<int>(cubes.keys.size());
+  G.above.resize(count), G.next.resize(count), G.weight.resize(count);
+  crew.forPieces(0, count, queryPiece, [&](int, int from, int to) {
+    for (int c = from; c < to; ++c) {
+      const SurfaceQuery at = S.query(cubes.centres[c]);
+      G.above[c] = std::llround(perDistance * perSquare * perH * at.side);
+      for (int d = 0; d < 6; ++d) {
+        std::array<std::int64_t, 3> beyond = Lattice::position(cubes.keys[c]);
+        beyond[d / 2] += d % 2 ? 2 : -2;
+        G.next[c][d] = cubes.number.get(Lattice::key(beyond)) - 1;
+        G.weight[c][d] = G.next[c][d] < 0 ? 0 : perSquare;
+        if (G.next[c][d] < 0 && !at.onRim) G.above[c] += at.side >= 0 ? perSquare : -perSquare;
+      }
     }
-  }
+  });
   for (int E : elementsOf(layer.T))
     for (int n : M.tets[E])
       if (M.dimension[n] < 3 && lattice.isNode(M.xi[n]))
@@ -4935,7 +4972,7 @@ struct DividedCubes {
   std::vector<std::uint64_t> above, below, touching;  // sorted; of those below the touching ones
 };                                                    // touch one above
 DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDistance& S,
-                         double perDistance) {
+                         double perDistance, const Crew& crew) {
   const Lattice lattice(A.level);
   std::vector<char> seen(B.M.x.size(), 0);
   std::vector<int> nodes;
@@ -4947,7 +4984,7 @@ DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDist
   Approximation layer = A;
   for (int n : nodes) addElementsAt(B, layer, n);
   const Cubes cubes(B.M, layer);
-  const std::vector<char> isAbove = minimumCut(graphOf(B.M, layer, cubes, S, perDistance));
+  const std::vector<char> isAbove = minimumCut(graphOf(B.M, layer, cubes, S, perDistance, crew));
   DividedCubes divided;
   KeyMap cornersAbove;
   for (std::size_t c = 0; c < isAbove.size(); ++c) {
@@ -4968,8 +5005,8 @@ DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDist
 }  // namespace
 
 Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S,
-                                  double perDistance) {
-  const DividedCubes cubes = divideCubes(B, A, S, perDistance);
+                                  double perDistance, const Crew& crew) {
+  const DividedCubes cubes = divideCubes(B, A, S, perDistance, crew);
   const KeyMap meshNode = nodesOf(B.M, A);
   for (std::uint64_t cube : cubes.touching) {
     int node = 0;
@@ -5152,43 +5189,53 @@ bool crossesAny(const TriangleTree& tree, const std::vector<Vec3>& x,
   return crosses;
 }
 
-Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S) {
+Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
+                     const Crew& crew) {
   constexpr double reach = 4;          // of h: no square of ∂T is farther from S
   constexpr double withSlack = 1.001;  // above the rounding of a bound
   constexpr double deep = 8;           // of h, from the rim of S: no square there is ever removed
   const std::vector<std::array<int, 3>> earlier = facesAround(M, S, reach * Q.h);
   const TriangleTree tree(M.x, earlier);
+  const std::size_t squares = Q.squares.size();
   Survey survey;
   survey.side.assign(M.x.size(), 0);
   survey.sharp.assign(M.x.size(), 0);
+  survey.free.resize(squares), survey.excess.resize(squares);
+  survey.beyond.assign(squares, {}), survey.above.assign(squares, {deep, deep, deep, deep});
+  if (Q.isMiddle) survey.facesUp.resize(squares);
+  std::vector<double> distance(squares);  // of the centres
   const double perH = 1 / Q.h;
-  for (const Square& s : Q.squares) {
+  // no point is farther from S than the square's centre and the way to it
+  const auto queryNear = [&](int i, Vec3 x) {
+    return S.query(x, withSlack * (distance[i] + norm(x - Q.squares[i].centre)));
+  };
+  const auto surveySquare = [&](int i) {
+    const Square& s = Q.squares[i];
     const SurfaceQuery middle = S.query(s.centre);
-    // no point is farther from S than the centre and the way to it
-    const auto queryNear = [&](Vec3 x) {
-      return S.query(x, withSlack * (middle.distance + norm(x - s.centre)));
-    };
+    distance[i] = middle.distance;
     bool isFree = true;
-    for (int n : s.node) {
-      isFree &= M.dimension[n] == 3;
-      if (survey.side[n] == 0) survey.side[n] = queryNear(M.x[n]).side >= 0 ? 1 : -1;
-    }
-    isFree = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
-    survey.free.push_back(isFree);
-    survey.excess.push_back(perH * middle.excess);
+    for (int n : s.node) isFree &= M.dimension[n] == 3;
+    survey.free[i] = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
+    survey.excess[i] = perH * middle.excess;
     if (Q.isMiddle)
-      survey.facesUp.push_back(s.facesAbove || (!s.facesBelow && S.query(s.beyond).side >= 0));
-    std::array<double, 4> beyond{}, above{deep, deep, deep, deep};
-    const bool isDeep = triangleWithin(S.rimTree, middle.point, deep * Q.h) < 0;
-    for (int e = 0; e < 4 && !isDeep; ++e) {
+      survey.facesUp[i] = s.facesAbove || (!s.facesBelow && S.query(s.beyond).side >= 0);
+    if (triangleWithin(S.rimTree, middle.point, deep * Q.h) < 0) return;
+    for (int e = 0; e < 4; ++e) {
       const SurfaceQuery near =
-          queryNear((1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
-      beyond[e] = perH * near.excess;
-      above[e] = near.onRim ? 0 : perH * S.rimDistance(near.point);
+          queryNear(i, (1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
+      survey.beyond[i][e] = perH * near.excess;
+      survey.above[i][e] = near.onRim ? 0 : perH * S.rimDistance(near.point);
     }
-    survey.beyond.push_back(beyond);
-    survey.above.push_back(above);
-  }
+  };
+  crew.forPieces(0, static_cast<int>(squares), queryPiece, [&](int, int from, int to) {
+    for (int i = from; i < to; ++i) surveySquare(i);
+  });
+  crew.forPieces(0, static_cast<int>(Q.nodes.size()), queryPiece, [&](int, int from, int to) {
+    for (int j = from; j < to; ++j) {
+      const int n = Q.nodes[j];
+      survey.side[n] = queryNear(Q.around[Q.start[n]].first, M.x[n]).side >= 0 ? 1 : -1;
+    }
+  });
   return survey;
 }
 
@@ -5656,7 +5703,7 @@ Extraction extractSurface(const Mesh& M, const SquareSurface& Q, const SurfaceDi
 
 Extraction surfaceExtraction(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
                              int side, Outline outline) {
-  return extractSurface(M, Q, S, surveySquares(M, Q, S), side, outline);
+  return extractSurface(M, Q, S, surveySquares(M, Q, S, Crew()), side, outline);
 }
 
 namespace {
@@ -6035,7 +6082,7 @@ SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
 std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
                                           const std::vector<char>& isRim, std::vector<Vec2> u,
                                           const std::vector<double>& mu,
-                                          const std::vector<Vec2>& anchor) {
+                                          const std::vector<Vec2>& anchor, const Crew& crew) {
   // Rows are the inner points, ring by ring from the rim: an order that suits the preconditioner.
   std::vector<int> row(u.size(), -1), point;
   auto add = [&](int n) {
@@ -6066,7 +6113,7 @@ std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
     x[1].push_back(u[n].y);
   }
   const SparseMatrix A = compressRows(std::move(entries), point.size());
-  for (int c = 0; c < 2; ++c) solveBiCGSTAB(A, b[c], x[c]);
+  crew.forPieces(0, 2, 1, [&](int c, int, int) { solveBiCGSTAB(A, b[c], x[c]); });
   for (int n : point) u[n] = {x[0][row[n]], x[1][row[n]]};
   return u;
 }
@@ -6083,11 +6130,12 @@ std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangl
 
 std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
                                          const std::vector<std::array<int, 3>>& triangles,
-                                         const std::vector<char>& isRim, std::vector<Vec2> u) {
+                                         const std::vector<char>& isRim, std::vector<Vec2> u,
+                                         const Crew& crew) {
   const SparseMatrix lambda = meanValueWeights(points, triangles, isRim);
   for (std::size_t i = 0; i < u.size(); ++i)
     if (!isRim[i]) u[i] = {.5, .5};
-  u = anchoredParametrization(lambda, isRim, u, RealVector(u.size(), 0.0), u);
+  u = anchoredParametrization(lambda, isRim, u, RealVector(u.size(), 0.0), u, crew);
   const std::vector<int> flipped = flippedTriangles(triangles, u);
   if (!flipped.empty())
     throw MethodError("insertSurface (§3.6): Floater's map is self-folding in parameter space: " +
@@ -6259,7 +6307,7 @@ Vec2 rimParameter(const std::array<double, 4>& cornerS, double L, double s) {
 
 }  // namespace
 
-SurfaceParametrization parametrizeSurface(const SurfaceDistance& S) {
+SurfaceParametrization parametrizeSurface(const SurfaceDistance& S, const Crew& crew) {
   const RimCorners corners = rimCorners(S);
   std::vector<int> loop = S.rim;
   std::rotate(loop.begin(), loop.begin() + corners.at[0], loop.end());
@@ -6277,7 +6325,7 @@ SurfaceParametrization parametrizeSurface(const SurfaceDistance& S) {
   Phi.surface.points = S.S.points;
   Phi.surface.triangles = S.S.triangles;
   Phi.surface.name = S.S.name;
-  Phi.surface.u = floaterParametrization(S.S.points, S.S.triangles, S.isRimPoint, u);
+  Phi.surface.u = floaterParametrization(S.S.points, S.S.triangles, S.isRimPoint, u, crew);
   return Phi;
 }
 
@@ -6285,11 +6333,12 @@ namespace {
 
 /// S_M with its own numbers: a disk oriented like S.
 struct ApproximatingSurface {
-  TriangleSurface S;        // points are the nodes' positions
-  std::vector<int> node;    // [points], number in M
-  std::vector<int> rim;     // loop of points, S_M on its left
-  std::vector<char> isRim;  // [points]
-  double h = 0;             // mean length of its edges
+  TriangleSurface S;                  // points are the nodes' positions
+  std::vector<int> node;              // [points], number in M
+  std::vector<int> rim;               // loop of points, S_M on its left
+  std::vector<char> isRim;            // [points]
+  double h = 0;                       // mean length of its edges
+  std::vector<SurfaceQuery> nearest;  // [points], on the surface that is inserted
 };
 
 /// The faces labelled k with their own numbers, oriented consistently.
@@ -6314,13 +6363,19 @@ ApproximatingSurface labelledSurface(const Mesh& M, int k) {
   return SM;
 }
 
-ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDistance& S) {
+ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDistance& S,
+                                          const Crew& crew) {
   ApproximatingSurface SM = labelledSurface(M, k);
+  const int points = static_cast<int>(SM.node.size());
+  SM.nearest.resize(points);
+  crew.forPieces(0, points, queryPiece, [&](int, int from, int to) {
+    for (int i = from; i < to; ++i) SM.nearest[i] = S.query(SM.S.points[i]);
+  });
   // The side of S's normals: by the nearest points of S, weighted by area.
   double agreement = 0;
   for (const std::array<int, 3>& t : SM.S.triangles) {
     const Vec3 a = SM.S.points[t[0]], b = SM.S.points[t[1]], c = SM.S.points[t[2]];
-    agreement += dot(cross(b - a, c - a), S.query((1. / 3) * (a + b + c)).normal);
+    for (int i : t) agreement += dot(cross(b - a, c - a), SM.nearest[i].normal);
     SM.h += (norm(b - a) + norm(c - b) + norm(a - c)) / (3 * double(SM.S.triangles.size()));
   }
   if (agreement < 0)
@@ -6575,14 +6630,14 @@ std::vector<char> holdBridges(const ApproximatingSurface& SM, const std::vector<
 /// anchors go, in growing rings, until none folds. Where some always do, as beside a bridge, the
 /// map with the fewest: without anchors the limbs of S_M move along S by many h.
 ///   u  set at the rim
-std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDistance& S,
-                              const Parametrization& Phi, std::vector<Vec2> u) {
+std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const Parametrization& Phi,
+                              std::vector<Vec2> u, const Crew& crew) {
   const std::vector<Vec2>& uS = Phi.u;
   std::vector<double> mu(u.size(), 0.0);
   for (std::size_t i = 0; i < u.size(); ++i) {
     if (SM.isRim[i]) continue;
-    const SurfaceQuery q = S.query(SM.S.points[i]);
-    const std::array<int, 3>& t = S.S.triangles[q.triangle];
+    const SurfaceQuery& q = SM.nearest[i];
+    const std::array<int, 3>& t = Phi.triangles[q.triangle];
     u[i] = q.w[0] * uS[t[0]] + q.w[1] * uS[t[1]] + q.w[2] * uS[t[2]];
     mu[i] = q.onRim ? 0 : anchorMu;
   }
@@ -6593,7 +6648,7 @@ std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const SurfaceDista
   std::vector<Vec2> best;
   std::size_t fewest = SM.S.triangles.size() + 1;
   for (int rings = 0; rings <= maxRings; rings = 2 * rings + 1) {
-    u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor);
+    u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor, crew);
     std::vector<int> flipped;
     for (int t : flippedTriangles(SM.S.triangles, u))
       if (!bridges[t]) flipped.push_back(t);
@@ -6639,15 +6694,15 @@ namespace {
 
 /// [§3.6] surfaceProjection() with ϕ, which is the same for all ways and sizes.
 ProjectionReport projectTo(Mesh& M, const SurfaceDistance& S, SurfaceParametrization Phi,
-                           bool followRim) {
+                           bool followRim, const Crew& crew) {
   const int k = static_cast<int>(M.surfaces.size()) + 1;
-  const ApproximatingSurface SM = approximatingSurface(M, k, S);
+  const ApproximatingSurface SM = approximatingSurface(M, k, S, crew);
   const RimTargets targets = rimTargets(SM, Phi, followRim);
   std::vector<Vec2> u(SM.node.size());  // ϕ_M⁻¹, eq. (3)
   for (std::size_t i = 0; i < SM.rim.size(); ++i)
     u[SM.rim[i]] = rimParameter(Phi.cornerS, Phi.rim.s.back(), targets.s[i]);
-  u = followRim ? anchoredMap(SM, S, Phi.surface, u)
-                : floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
+  u = followRim ? anchoredMap(SM, Phi.surface, u, crew)
+                : floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u, crew);
 
   Phi.surface.rim = static_cast<int>(M.curves.size()) + 1;
   Phi.rim.sides[0].surface = k;
@@ -6656,15 +6711,15 @@ ProjectionReport projectTo(Mesh& M, const SurfaceDistance& S, SurfaceParametriza
   ProjectionReport report;
   report.cornerNodes = placeNodes(M, SM, u, targets, Phi.cornerS);  // x', eq. (4)
   for (std::size_t i = 0; i < SM.node.size(); ++i) {
-    const Vec3 nearest = S.query(SM.S.points[i]).point;
-    report.tangentialShift = std::max(report.tangentialShift, norm(M.x[SM.node[i]] - nearest));
+    const double shift = norm(M.x[SM.node[i]] - SM.nearest[i].point);
+    report.tangentialShift = std::max(report.tangentialShift, shift);
   }
   return report;
 }
 
 /// ϕ, eq. (3), with its locator.
-SurfaceParametrization locatedParametrization(const SurfaceDistance& S) {
-  SurfaceParametrization Phi = parametrizeSurface(S);
+SurfaceParametrization locatedParametrization(const SurfaceDistance& S, const Crew& crew) {
+  SurfaceParametrization Phi = parametrizeSurface(S, crew);
   buildLocator(Phi.surface);
   return Phi;
 }
@@ -6675,7 +6730,8 @@ ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool
   TriangleSurface split = cleaned;
   splitChords(split);
   const SurfaceDistance S(split);
-  return projectTo(M, S, locatedParametrization(S), followRim);
+  const Crew alone;
+  return projectTo(M, S, locatedParametrization(S, alone), followRim, alone);
 }
 
 // ==== 3. Surface insertion =======================================================================
@@ -6789,6 +6845,7 @@ struct Insertion {
   const Mesh& original;  // the caller's
   const SurfaceDistance& S;
   const InsertOptions& options;
+  const Crew& crew;
   int k;         // number of the new surface
   bool crosses;  // S itself
   Layer layer = {};
@@ -6878,13 +6935,13 @@ void refineLayer(Insertion& I, bool isAgain) {
   const double h = cubeEdge(I.original, cubeLevel(I.original, layer.lc));
   layer.M = roomyCopy(I.original, predictedTets(areaOf(I.S.S), h));
   Bisection B(layer.M);
-  layer.A = volumetricApproximation(B, I.S, layer.lc);
+  layer.A = volumetricApproximation(B, I.S, layer.lc, I.crew);
   if (!isAgain) I.stage("approximated", layer.M);
   if (!isAgain) checkFacesApart(I);
   volumetricHealing(B, layer.A);
   if (layer.course != Course::sides) {
     const double perDistance = layer.course == Course::cheapest ? cheapest : centres;
-    layer.A = middleApproximation(B, layer.A, I.S, perDistance);
+    layer.A = middleApproximation(B, layer.A, I.S, perDistance, I.crew);
     volumetricHealing(B, layer.A);
   }
   layer.neighbour = std::move(B.neighbour);
@@ -7055,8 +7112,8 @@ bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertRepo
   I.stage("surfaceHealed", M);
   I.progress("3.5 surface healing: " + std::to_string(rounds) + " rounds, " +
              std::to_string(M.tets.size()) + " tetrahedra (" + describe(way) + ")");
-  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S);
-  const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim);
+  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S, I.crew);
+  const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim, I.crew);
   report.tangentialShift = projection.tangentialShift;
   report.projected = qualityStatistics(M);
   I.stage("projected", M);
@@ -7080,17 +7137,20 @@ constexpr double distancePerLc = .25;  // [choice] of l_c, between samples of la
 
 /// The measures of S_M that the report promises.
 ///   errors  MethodError: a node of it is off S
-void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& report) {
+void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& report,
+                    const Crew& crew) {
   const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
   std::vector<char> on(M.x.size(), 0);
-  report.nodes = 0, report.maxNodeDistance = 0;
+  std::vector<int> nodes;
   for (const auto& face : faces)
-    for (int n : face) {
-      if (on[n]) continue;
-      on[n] = 1;
-      ++report.nodes;
-      report.maxNodeDistance = std::max(report.maxNodeDistance, S.query(M.x[n]).distance);
-    }
+    for (int n : face)
+      if (!on[n]) on[n] = 1, nodes.push_back(n);
+  report.nodes = static_cast<int>(nodes.size());
+  std::vector<double> distance(nodes.size());
+  crew.forPieces(0, report.nodes, queryPiece, [&](int, int from, int to) {
+    for (int i = from; i < to; ++i) distance[i] = S.query(M.x[nodes[i]]).distance;
+  });
+  report.maxNodeDistance = *std::max_element(distance.begin(), distance.end());
   // [choice] on S: 1e-12 of its diagonal, and the last digits of coordinates far from the origin
   const TriangleTree::Box& box = S.tree.nodes[0].box;
   const double allowed = 1e-12 * norm(box.hi - box.lo) + 1e-15 * (norm(box.hi) + norm(box.lo));
@@ -7098,8 +7158,8 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
     throw MethodError("insertSurface (§3.6): a node of S_M is " + number(report.maxNodeDistance) +
                       " away from S");
   report.triangles = static_cast<int>(faces.size());
-  const Width farthest =
-      farthestPoint(TriangleTree(M.x, faces), S.tree, distanceSamples, distancePerLc * report.lc);
+  const Width farthest = farthestPoint(TriangleTree(M.x, faces), S.tree, distanceSamples,
+                                       distancePerLc * report.lc, crew);
   report.hausdorff = farthest.distance, report.hausdorffPlace = farthest.place;
 }
 
@@ -7203,7 +7263,7 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
     optimizeAround(trial, I, true, active, after);
     if (after.optimization.inverted > 0) return;
     after.smoothed = after.optimization.quality;
-    measureSurface(trial, I.S, after);
+    measureSurface(trial, I.S, after, I.crew);
     I.progress("3.7 refined where S_M is far from S: " + number(after.hausdorff / lc) + " l_c, " +
                std::to_string(trial.tets.size()) + " tetrahedra, min " +
                number(after.smoothed.min));
@@ -7226,7 +7286,7 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
   ofThisWay.surface = I.k, ofThisWay.lc = lc;
   try {
     if (!insertOnWay(I, way, patient, trial, ofThisWay)) return false;
-    measureSurface(trial, I.S, ofThisWay);
+    measureSurface(trial, I.S, ofThisWay, I.crew);
     I.progress("S_M: Hausdorff distance " + number(ofThisWay.hausdorff) + ", " +
                number(ofThisWay.hausdorff / lc) + " l_c");
     refineFarFaces(I, trial, ofThisWay);
@@ -7255,7 +7315,7 @@ void survey(Insertion& I) {
     throw MethodError("insertSurface (§3.3): " + layer.Q.fault + "; lower l_c");
   if (!layer.Q.fault.empty())
     I.progress("3.3 healing: " + layer.Q.fault + "; S_M may still be a disk");
-  layer.survey = surveySquares(layer.M, layer.Q, I.S);
+  layer.survey = surveySquares(layer.M, layer.Q, I.S, I.crew);
   I.stage("healed", layer.M);
   I.progress((layer.Q.isMiddle ? "3.3 middle: " : "3.2-3.3 approximation: ") +
              std::to_string(layer.M.tets.size()) + " tetrahedra, " +
@@ -7467,7 +7527,7 @@ void smoothTogether(Insertion& I, Mesh& M, InsertReport& report) {
   optimizeAround(trial, I, true, {}, after);
   after.smoothed = after.optimization.quality;
   if (after.smoothed.inverted > 0 || after.smoothed.min <= lowest) return;
-  measureSurface(trial, I.S, after);
+  measureSurface(trial, I.S, after, I.crew);
   if (after.hausdorff > std::max(report.hausdorff, poorHausdorff * report.lc)) return;
   if (I.options.tolerance > 0 && after.hausdorff > I.options.tolerance) return;
   after.optimization.sweeps += report.optimization.sweeps;
@@ -7485,11 +7545,11 @@ struct Candidate {
 };
 
 Candidate candidateOf(const TriangleSurface& S, const std::string& label,
-                      std::vector<std::string> warnings = {}) {
+                      std::vector<std::string> warnings, const Crew& crew) {
   TriangleSurface disk = checkSurface(S, warnings);
   splitChords(disk);
   SurfaceDistance distance(disk);
-  const std::vector<Crossing> crossings = selfCrossings(disk, distance.tree);
+  const std::vector<Crossing> crossings = selfCrossings(disk, distance.tree, crew);
   if (!crossings.empty())
     warnings.push_back(describe(crossings) + "; mend it there if the insertion fails");
   return {std::move(distance), label, std::move(warnings), !crossings.empty()};
@@ -7511,7 +7571,7 @@ auto labelled(const std::string& label, Step step) -> decltype(step()) {
 }
 
 /// The surfaces of a call, each component one; labels only where there are several.
-std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S) {
+std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S, const Crew& crew) {
   std::vector<Candidate> all;
   for (std::size_t i = 0; i < S.size(); ++i) {
     const std::string given = S.size() > 1 ? labelOf(S[i].name, i + 1) : "";
@@ -7520,7 +7580,7 @@ std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S) {
         labelled(given, [&] { return connectedComponents(S[i], warnings); });
     for (const TriangleSurface& one : components) {
       const std::string label = components.size() > 1 ? labelOf(one.name, i + 1) : given;
-      all.push_back(labelled(label, [&] { return candidateOf(one, label, warnings); }));
+      all.push_back(labelled(label, [&] { return candidateOf(one, label, warnings, crew); }));
       warnings.clear();
     }
   }
@@ -7550,13 +7610,14 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
 /// 3.2 to 3.7 for one surface, at the sizes that are to be tried.
 ///   original  the statistics of M
 InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options,
-                             const QualityStatistics& original) {
+                             const QualityStatistics& original, const Crew& crew) {
   const SurfaceDistance& cleaned = candidate.S;
   InsertReport report;
   report.original = original;
 
   SizeChoice chosen;
-  Insertion I{M, cleaned, options, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
+  Insertion I{
+      M, cleaned, options, crew, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
   if (options.lc == 0 && options.tolerance == 0) {
     chosen = chooseSize(M, cleaned);
     I.progress("3.2 l_c = " + number(chosen.lc) + " chosen: " + describe(chosen));
@@ -7607,27 +7668,29 @@ QualityStatistics checkStart(const Mesh& M, const InsertOptions& options) {
 
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
   const QualityStatistics original = checkStart(M, options);
-  const Candidate one = candidateOf(S, "");
+  const Crew crew(options.optimize.threads);
+  const Candidate one = candidateOf(S, "", {}, crew);
   checkApart(M, {one});
-  return insertCandidate(M, one, options, original);
+  return insertCandidate(M, one, options, original, crew);
 }
 
 std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
                                          const InsertOptions& options) {
   QualityStatistics q = checkStart(M, options);
-  std::vector<Candidate> all = candidatesOf(S);
+  const Crew crew(options.optimize.threads);
+  std::vector<Candidate> all = candidatesOf(S, crew);
   checkApart(M, all);
   largestFirst(all);
   Mesh result = M;
   std::vector<InsertReport> reports;
   for (const Candidate& one : all) {
     reports.push_back(
-        labelled(one.label, [&] { return insertCandidate(result, one, options, q); }));
+        labelled(one.label, [&] { return insertCandidate(result, one, options, q, crew); }));
     q = reports.back().smoothed;
   }
   for (std::size_t i = 0; i + 1 < all.size();
        ++i)  // later ones have refined and moved earlier ones
-    labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i]); });
+    labelled(all[i].label, [&] { measureSurface(result, all[i].S, reports[i], crew); });
   M = std::move(result);
   return reports;
 }

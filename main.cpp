@@ -3694,8 +3694,8 @@ constexpr Option outputOption{"-o", "OUT", "the mesh to write: .vtk, .msh (Gmsh)
 constexpr Option paperOption{"--paper", "", "the paper to the letter, not the best known choices"};
 constexpr Option powerOption{
     "--power", "P", "exponent of the term that lifts the worst elements (default 64; 1: none)"};
-constexpr Option threadsOption{
-    "--threads", "N", "threads that smooth (default 0: all cores); the result is the same for any"};
+constexpr Option threadsOption{"--threads", "N",
+                               "threads (default 0: all cores); the result is the same for any"};
 constexpr Option maxTetsOption{"--max-tets", "N",
                                "refuse where more tetrahedra are predicted (default 20000000)"};
 constexpr Option quietOption{"--quiet", "", "no progress on standard error"};

@@ -239,8 +239,8 @@ struct OptimizeOptions {
   double relaxation = 1.6;
   // §3.7.4: both Wolfe conditions at inner nodes, as printed; [departure] false: the first alone
   bool strongWolfe = false;
-  // Threads that share a sweep, 0: all cores; the result is the same for every number. 1 here,
-  // for a host has threads of its own; the program takes all cores.
+  // Threads that share the loops, those of an insertion outside §3.7 too; 0: all cores. The result
+  // is the same for every number. 1 here, for a host has threads of its own; the program takes all.
   int threads = 1;
   // [§3.7.4 departure] sweeps that Anderson's acceleration mixes; [0, 8], 0: none, and every move
   // wakes the neighbours while the mesh is tangled
@@ -723,7 +723,8 @@ struct Crossing {
   Vec3 point;
 };
 std::vector<Crossing> selfCrossings(const TriangleSurface& S);
-std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& tree);
+std::vector<Crossing> selfCrossings(const TriangleSurface& S, const TriangleTree& tree,
+                                    const Crew& crew = Crew());
 
 /// [§3.2] The distance of sheets of S that face each other: the 5 % quantile over S of the distance
 /// along the normals; 1e300 where none is within `reach`.
@@ -739,7 +740,7 @@ Width rimWidth(const SurfaceDistance& S, double apart);
 /// Two-sided Hausdorff distance and its place, sampled: each triangle at a lattice of
 /// samplesPerEdge >= 1 steps, more where these would be longer than `spacing`.
 Width farthestPoint(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
-                    double spacing = 1e300);
+                    double spacing = 1e300, const Crew& crew = Crew());
 double hausdorffDistance(const TriangleTree& A, const TriangleTree& B, int samplesPerEdge,
                          double spacing = 1e300);
 
@@ -771,7 +772,8 @@ struct Approximation {
   std::vector<std::uint64_t> above = {}, below = {};
 };
 /// [§3.2, eq. (1)] Refines the tetrahedra cut by S until none has r^E >= l_c.
-Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc);
+Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc,
+                                      const Crew& crew = Crew());
 
 // ==== 3.3 Volumetric approximation healing ======================================================
 
@@ -828,7 +830,7 @@ SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
 /// perDistance lets the centres decide alone. To be healed by volumetricHealing().
 ///   source  the minimum cut of a graph; Dinic 1970
 Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S,
-                                  double perDistance);
+                                  double perDistance, const Crew& crew = Crew());
 
 /// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1
 /// and the centre. 0 nothing, 15 the square; 3, 6, 12, 9 the halves along a diagonal.
@@ -913,13 +915,15 @@ SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
 ///   errors  SolverError; MethodError where a parametric triangle is not counter-clockwise
 std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
                                          const std::vector<std::array<int, 3>>& triangles,
-                                         const std::vector<char>& isRim, std::vector<Vec2> u);
+                                         const std::vector<char>& isRim, std::vector<Vec2> u,
+                                         const Crew& crew = Crew());
 
 /// [§3.6 departure] (1 + μ_i) u_i − Σ λ_ij u_j = μ_i a_i inside pulls u_i to its anchor a_i.
 std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
                                           const std::vector<char>& isRim, std::vector<Vec2> u,
                                           const std::vector<double>& mu,
-                                          const std::vector<Vec2>& anchor);
+                                          const std::vector<Vec2>& anchor,
+                                          const Crew& crew = Crew());
 
 /// Triangles of 𝓤 that are not counter-clockwise.
 std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangles,
@@ -945,7 +949,7 @@ struct SurfaceParametrization {
   std::array<double, 4> cornerS;  // arc length of the four corners, the first is 0
   std::array<bool, 4> sharp;
 };
-SurfaceParametrization parametrizeSurface(const SurfaceDistance& S);
+SurfaceParametrization parametrizeSurface(const SurfaceDistance& S, const Crew& crew = Crew());
 
 struct ProjectionReport {
   double tangentialShift = 0;    // largest distance of x' from the point of S nearest to x

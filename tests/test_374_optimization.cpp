@@ -3,7 +3,10 @@
 // §3.7.4: line search, Algorithm 2, untangling, errors.
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cstring>
+#include <string>
+#include <vector>
 
 #include "shapes.hpp"
 
@@ -450,6 +453,33 @@ TEST_SUITE("3.7.4") {
         valid = valid || sweep.inverted == 0;
       };
       CHECK(optimizeMesh(M, options).inverted == 0);
+    }
+  }
+
+  TEST_CASE("threads: every item of a loop once, and of what is thrown the first piece's") {
+    for (int threads : {1, 2, 7}) {
+      CAPTURE(threads);
+      const Crew crew(threads);
+      for (int end : {3, 4, 100, 1003}) {
+        std::vector<int> times(end, 0);
+        crew.forPieces(3, end, 10, [&](int k, int from, int to) {
+          CHECK(from == 3 + 10 * k);
+          CHECK(to <= std::min(end, from + 10));
+          for (int i = from; i < to; ++i) ++times[i];
+        });
+        CHECK(std::count(times.begin(), times.end(), 1) == end - 3);
+        CHECK(std::count(times.begin(), times.begin() + 3, 0) == 3);
+      }
+      std::string thrown;
+      try {
+        crew.forPieces(0, 100, 1, [](int k, int, int) {
+          if (k >= 20) throw MethodError(std::to_string(k));
+        });
+      } catch (const MethodError& error) {
+        thrown = error.what();
+      }
+      CHECK(thrown == "20");
+      crew.forPieces(0, 0, 1, [](int, int, int) { CHECK(false); });
     }
   }
 

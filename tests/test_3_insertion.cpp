@@ -240,6 +240,25 @@ TEST_SUITE("3") {
     }
   }
 
+  TEST_CASE("insertion: the number of threads does not change a byte") {
+    const TriangleSurface S = samples::sine(.1, 64);
+    Mesh one;
+    InsertReport report;
+    for (int threads : {1, 2, 5}) {
+      CAPTURE(threads);
+      InsertOptions options = withSize(.06);
+      options.optimize.threads = threads;
+      Mesh M = unitBox();
+      const InsertReport now = insertSurface(M, S, options);
+      if (threads == 1) one = M, report = now;
+      CHECK(shapes::sameMesh(M, one));
+      CHECK(now.hausdorff == report.hausdorff);
+      CHECK(now.hausdorffPlace == report.hausdorffPlace);
+      CHECK(now.maxNodeDistance == report.maxNodeDistance);
+      CHECK(now.tangentialShift == report.tangentialShift);
+    }
+  }
+
   TEST_CASE("insertion: random patches keep the promises, default and to the letter") {
     for (int seed : {1, 2, 3}) {
       CAPTURE(seed);
