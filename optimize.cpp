@@ -1975,10 +1975,11 @@ constexpr double liftMinGain = .002;   // or where the lowest q rises by less
 constexpr int idleRounds = 2;          // in so many rounds,
 constexpr double liftStill = .001;     // or at once where neither it nor q_w rises by this
 constexpr double perfect = .9995;      // a lowest q that is not lifted
-constexpr double lowQuality = .45;     // below it the lift has patience:
+constexpr double lowQuality = .45;     // below it the lift has patience,
+constexpr double lowGuarded = .7;      // below this where moves may be refused:
 constexpr int patientRounds = 60, patientIdleRounds = 8;
 constexpr double liftWake = .05;  // unrest for a visit: only what happens near the worst counts
-constexpr int lastSweeps = 4;
+constexpr int lastSweeps = 4, lastGuarded = 8;
 constexpr double lastWake = .01;      // unrest in the last sweeps, and the displacement relative to
 constexpr double lastMaxDisp = 1e-3;  // the shortest edge where they end
 constexpr double liftReach = .03;  // change of (η/η_w)^power from one round to the next: below it
@@ -2075,9 +2076,10 @@ void liftWorst(Smoother& S) {
   updateWorst(S, worst);
   const double meanAtStart = worst.mean;
   if (worst.lowest > perfect) return;
+  const bool guarded = S.options.accept != nullptr;
   double highest = worst.lowest;
   for (int round = 0, idle = 0; sweepsLeft(S); ++round) {
-    const bool low = worst.lowest < lowQuality;
+    const bool low = worst.lowest < (guarded ? lowGuarded : lowQuality);
     if (round >= (low ? patientRounds : liftRounds)) break;
     if (idle >= (low ? patientIdleRounds : idleRounds)) break;
     const double bound = worst.bound, lowest = worst.lowest;
@@ -2092,7 +2094,7 @@ void liftWorst(Smoother& S) {
     if (rises) highest = worst.lowest;
   }
   aimLift(S, worst, worst.lowest, lastWake);
-  for (int k = 0; k < lastSweeps && sweepsLeft(S); ++k)
+  for (int k = 0; k < (guarded ? lastGuarded : lastSweeps) && sweepsLeft(S); ++k)
     if (sweepNodes(S) <= lastMaxDisp) return;
 }
 
