@@ -2166,6 +2166,10 @@ void Bisection::star(int n, std::vector<int>& around) const {
   walkStar(n, around, [](int) { return false; });
 }
 
+int Bisection::coarserAt(int n, int level, std::vector<int>& around) const {
+  return walkStar(n, around, [&](int t) { return M.level[t] < level; });
+}
+
 int Bisection::tetWithEdge(int a, int b) const {
   std::vector<int> around;
   return walkStar(a, around, [&](int t) { return localIndex(M.tets[t], b) >= 0; });
@@ -4756,16 +4760,7 @@ bool isOnBoundary(const Mesh& M, int n) {
 /// The elements adjacent to the node, refined to T's level, join T.
 void addElementsAt(Bisection& B, Approximation& A, int node) {
   std::vector<int> around, added;
-  for (bool coarse = true; coarse;) {
-    coarse = false;
-    B.star(node, around);
-    for (int E : around)
-      if (B.M.level[E] < A.level) {
-        B.bisect(E);
-        coarse = true;
-        break;
-      }
-  }
+  for (int E; (E = B.coarserAt(node, A.level, around)) >= 0;) B.bisect(E);
   A.T.resize(B.M.tets.size(), 0);
   for (int E : around)
     if (!A.T[E]) {
@@ -5016,12 +5011,12 @@ Approximation middleApproximation(Bisection& B, const Approximation& A, const Su
   Approximation middle;
   middle.level = A.level, middle.isMiddle = true, middle.above = cubes.above,
   middle.below = cubes.below;
+  KeyMap isTouching(cubes.touching.size());
+  for (std::uint64_t cube : cubes.touching) isTouching[cube] = 1;
   middle.T.assign(B.M.tets.size(), 0);
-  for (std::size_t E = 0; E < middle.T.size(); ++E) {
-    if (B.M.level[E] < A.level) continue;
-    const std::uint64_t cube = Lattice(A.level).cubeOf(B.M, static_cast<int>(E));
-    middle.T[E] = std::binary_search(cubes.touching.begin(), cubes.touching.end(), cube);
-  }
+  for (std::size_t E = 0; E < middle.T.size(); ++E)
+    if (B.M.level[E] >= A.level)
+      middle.T[E] = isTouching.get(Lattice(A.level).cubeOf(B.M, static_cast<int>(E))) > 0;
   return middle;
 }
 

@@ -430,9 +430,11 @@ struct Bisection {
   void bisect(int E, int depth = 0);
   /// Bisects tetrahedra at the edge (a, b) until it is split; nothing where there is no such edge.
   void bisectEdge(int a, int b);
-  /// The tetrahedra around the edge (a, b) of E, E first; those at node n; one with the edge or -1.
+  /// The tetrahedra around the edge (a, b) of E, E first; those at node n; the first of these below
+  /// a level, or -1 (only then around is whole); one with the edge, or -1.
   void ring(int E, int a, int b, std::vector<int>& around) const;
   void star(int n, std::vector<int>& around) const;
+  int coarserAt(int n, int level, std::vector<int>& around) const;
   int tetWithEdge(int a, int b) const;
   /// Takes the bisections back at its end: the mesh and its adjacency are as they were, the log is
   /// empty. One at a time.
