@@ -2403,6 +2403,7 @@ void Bisection::bisectRing(const std::vector<int>& around) {
     std::array<int, 4> z, neighbour, label;
   };
   std::vector<Half> halves;
+  halves.reserve(2 * around.size());
   for (int t : around) {
     const std::array<int, 4> z = M.tets[t], N = neighbour[t], L = M.faceLabel[t];
     const int t1 = child(t, z[1]);
@@ -2445,7 +2446,7 @@ void Bisection::bisectRing(const std::vector<int>& around) {
 }
 
 void Bisection::keepForUndo(int E) {
-  if (undoTets < 0) return;
+  if (E >= undoTets) return;  // new in the trial, or there is none
   before.push_back({E, M.tets[E], neighbour[E], M.faceLabel[E], M.type[E], M.level[E]});
 }
 
@@ -2461,9 +2462,8 @@ void Bisection::undo() {
   for (auto b = before.rbegin(); b != before.rend(); ++b) {
     M.tets[b->E] = b->tet, neighbour[b->E] = b->neighbour, M.faceLabel[b->E] = b->label;
     M.type[b->E] = b->type, M.level[b->E] = b->level;
-    if (b->E < undoTets)
-      for (int n : b->tet)
-        if (n < static_cast<int>(undoNodes)) tetOf[n] = b->E;
+    for (int n : b->tet)
+      if (n < static_cast<int>(undoNodes)) tetOf[n] = b->E;
   }
   M.tets.resize(undoTets), neighbour.resize(undoTets), M.faceLabel.resize(undoTets);
   M.type.resize(undoTets), M.level.resize(undoTets);
