@@ -4464,8 +4464,15 @@ bool isTooLarge(const Mesh& M, int E, double lc) { return longestEdge(M, E) >= l
 
 namespace {
 
-/// Whether S meets tetrahedron E: candidates by the tree, then by clipping.
-bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
+/// Whether a tetrahedron is cut by S.
+struct Cut {
+  enum { unknown, yes, no } is = unknown;
+  int triangle = -1;  // of S, which meets it or met its parent; -1: none is known
+};
+
+/// Whether S meets tetrahedron E: the triangle that is known, else candidates by the tree; by
+/// clipping.
+Cut cutBySurface(const Mesh& M, int E, const SurfaceDistance& S, int known) {
   std::array<Vec3, 4> tet;
   for (int i = 0; i < 4; ++i) tet[i] = M.x[M.tets[E][i]];
   Vec3 lo = tet[0], hi = tet[0];
@@ -4474,15 +4481,16 @@ bool meetsSurface(const Mesh& M, int E, const SurfaceDistance& S) {
     hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
   }
   const Vec3 margin = 1e-9 * (hi - lo);
-  if (!boxesMeet(S.tree.nodes[0].box, lo - margin, hi + margin)) return false;
+  if (!boxesMeet(S.tree.nodes[0].box, lo - margin, hi + margin)) return {Cut::no};
   const FacePlanes planes(tet);
-  bool hit = false;
-  S.tree.visit(lo - margin, hi + margin,
-               [&](int t) { return hit = meets(planes, cornersOf(S.S, t)); });
-  return hit;
+  if (known >= 0 && meets(planes, cornersOf(S.S, known))) return {Cut::yes, known};
+  Cut cut{Cut::no};
+  S.tree.visit(lo - margin, hi + margin, [&](int t) {
+    if (meets(planes, cornersOf(S.S, t))) cut = {Cut::yes, t};
+    return cut.is == Cut::yes;
+  });
+  return cut;
 }
-
-enum class Cut : char { unknown, yes, no };
 
 /// Refines the tetrahedra cut by S that `wanted` asks for until there is none.
 template <class Wanted>
@@ -4492,25 +4500,26 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, co
   std::vector<int> changed(B.M.tets.size());
   std::iota(changed.begin(), changed.end(), 0);
   for (int pass = 0; pass < maxPasses; ++pass) {
-    cut.resize(B.M.tets.size(), Cut::unknown);
+    cut.resize(B.M.tets.size());
     crew.forPieces(0, static_cast<int>(changed.size()), queryPiece, [&](int, int from, int to) {
       for (int i = from; i < to; ++i)
-        if (Cut& known = cut[changed[i]]; known == Cut::unknown)
-          known = meetsSurface(B.M, changed[i], S) ? Cut::yes : Cut::no;
+        if (Cut& known = cut[changed[i]]; known.is == Cut::unknown)
+          known = cutBySurface(B.M, changed[i], S, known.triangle);
     });
     std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
     for (int E : changed)
-      if (cut[E] == Cut::yes && wanted(E)) refine.push_back({E, B.M.level[E]});
+      if (cut[E].is == Cut::yes && wanted(E)) refine.push_back({E, B.M.level[E]});
     if (refine.empty()) return;
     B.splits.clear();
     for (const auto& [E, level] : refine)
       if (B.M.level[E] == level) B.bisect(E);
-    cut.resize(B.M.tets.size(), Cut::unknown);
+    cut.resize(B.M.tets.size());
     changed.clear();
     // what is not cut has no parts that are, but where a midpoint was moved onto a surface
     for (const Bisection::Split& split : B.splits) {
       const bool isPart = B.M.dimension[split.midpoint] == 3;
-      const Cut part = isPart && cut[split.parent] == Cut::no ? Cut::no : Cut::unknown;
+      const Cut whole = cut[split.parent];
+      const Cut part = isPart && whole.is == Cut::no ? whole : Cut{Cut::unknown, whole.triangle};
       cut[split.parent] = cut[split.child] = part;
       changed.push_back(split.parent), changed.push_back(split.child);
     }
@@ -4612,7 +4621,7 @@ Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, do
   // [choice] on to whole cubes, which §3.3 asks for: up to two bisections more than eq. (1)
   refineCut(B, S, cut, crew, [&](int E) { return B.M.level[E] < A.level; });
   A.T.resize(cut.size());
-  for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E] == Cut::yes;
+  for (std::size_t E = 0; E < cut.size(); ++E) A.T[E] = cut[E].is == Cut::yes;
   return A;
 }
 
