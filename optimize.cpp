@@ -684,14 +684,16 @@ void Crew::Threads::run(const std::function<void()>& shared) {
 
 namespace {
 
-int coresOr(int threads) {
+/// How many threads to start where so many are asked for (0: all cores).
+int usefulThreads(int wanted) {
+  constexpr int few = 16;  // [choice] are taken on any machine; more of them than cores never
   const int cores = static_cast<int>(std::thread::hardware_concurrency());
-  return threads > 0 ? threads : std::max(1, cores);
+  return wanted > 0 ? std::min(wanted, std::max(few, cores)) : std::max(1, cores);
 }
 
 }  // namespace
 
-Crew::Crew(int threads) : threads_(std::make_unique<Threads>(coresOr(threads))) {}
+Crew::Crew(int threads) : threads_(std::make_unique<Threads>(usefulThreads(threads))) {}
 Crew::Crew(Crew&&) noexcept = default;
 Crew& Crew::operator=(Crew&&) noexcept = default;
 Crew::~Crew() = default;
@@ -1141,7 +1143,7 @@ void fillSheets(Smoother& S, const std::vector<SheetFace>& faces) {
 void hireCrew(Smoother& S) {
   constexpr int elementsPerThread = 500;  // fewer are not worth one
   const int useful = 1 + static_cast<int>(S.elements.size()) / elementsPerThread;
-  S.crew = Crew(S.options.accept ? 1 : std::min(coresOr(S.options.threads), useful));
+  S.crew = Crew(S.options.accept ? 1 : std::min(usefulThreads(S.options.threads), useful));
 }
 
 /// All that is known of the elements before the first sweep.

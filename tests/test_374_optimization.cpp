@@ -457,7 +457,7 @@ TEST_SUITE("3.7.4") {
   }
 
   TEST_CASE("threads: every item of a loop once, and of what is thrown the first piece's") {
-    for (int threads : {1, 2, 7}) {
+    for (int threads : {0, 1, 2, 7, 1000000}) {
       CAPTURE(threads);
       const Crew crew(threads);
       for (int end : {3, 4, 100, 1003}) {
