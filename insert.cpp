@@ -7154,7 +7154,8 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
   crew.forPieces(0, report.nodes, queryPiece, [&](int, int from, int to) {
     for (int i = from; i < to; ++i) distance[i] = S.query(M.x[nodes[i]]).distance;
   });
-  report.maxNodeDistance = *std::max_element(distance.begin(), distance.end());
+  report.maxNodeDistance = 0;
+  for (double d : distance) report.maxNodeDistance = std::max(report.maxNodeDistance, d);
   // [choice] on S: 1e-12 of its diagonal, and the last digits of coordinates far from the origin
   const TriangleTree::Box& box = S.tree.nodes[0].box;
   const double allowed = 1e-12 * norm(box.hi - box.lo) + 1e-15 * (norm(box.hi) + norm(box.lo));
@@ -7523,16 +7524,20 @@ namespace {
 /// lowest q has become poor, all are once more: it rises by .03 to .07 in the real sets.
 void smoothTogether(Insertion& I, Mesh& M, InsertReport& report) {
   constexpr double poor = .6;
-  const double lowest = report.smoothed.min;
-  if (I.k == 1 || I.options.outline == Outline::paper) return;
+  const double lowest = report.smoothed.min, farthest = poorHausdorff * report.lc;
+  if (I.k == 1 || I.options.outline == Outline::paper || report.hausdorff > farthest) return;
   if (lowest >= poor || lowest > report.original.min - betterBy) return;
   Mesh trial = M;
   InsertReport after = report;
-  optimizeAround(trial, I, true, {}, after);
-  after.smoothed = after.optimization.quality;
-  if (after.smoothed.inverted > 0 || after.smoothed.min <= lowest) return;
-  measureSurface(trial, I.S, after, I.crew);
-  if (after.hausdorff > std::max(report.hausdorff, poorHausdorff * report.lc)) return;
+  try {
+    optimizeAround(trial, I, true, {}, after);
+    after.smoothed = after.optimization.quality;
+    if (after.smoothed.inverted > 0 || after.smoothed.min <= lowest) return;
+    measureSurface(trial, I.S, after, I.crew);
+  } catch (const MethodError& error) {
+    return I.progress(std::string("3.7 all nodes once more left: ") + error.what());
+  }
+  if (after.hausdorff > farthest) return;
   if (I.options.tolerance > 0 && after.hausdorff > I.options.tolerance) return;
   after.optimization.sweeps += report.optimization.sweeps;
   after.optimization.visits += report.optimization.visits;

@@ -112,15 +112,15 @@ bool solveCholesky(const Mat3& A, Vec3 b, Vec3& p);
 class Crew {
  public:
   /// Of so many threads, the caller's among them, but not more than the cores where these are above
-  /// 16; 0: of all cores. They start with the first loop that has several pieces.
+  /// 16; 0: of all cores. They start with the first loop that has a piece for them.
   explicit Crew(int threads = 1);
   Crew(Crew&&) noexcept;
   Crew& operator=(Crew&&) noexcept;
   ~Crew();
 
   /// task(k, from, to) for the pieces k of [begin, end), `size` long, which the threads take in
-  /// turn: whatever the tasks do may not depend on who does it and when. No task shares a loop of
-  /// its own in the same crew.
+  /// turn: whatever the tasks do may not depend on who does it and when. One loop at a time, and
+  /// none in a task.
   ///   errors  what a task throws ends the loop; of several the lowest piece's is thrown again
   using Task = std::function<void(int k, int from, int to)>;
   void forPieces(int begin, int end, int size, const Task& task) const;

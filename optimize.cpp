@@ -613,10 +613,10 @@ constexpr int patience = 200;  // [choice] looks before a thread sleeps: some 10
 struct Crew::Threads {
   explicit Threads(int threads) : wanted(threads) {}
   ~Threads();
-  void start();
+  void start(int threads);
   void serve();
   /// job() here and in those of the others that come before it ends here.
-  void run(const std::function<void()>& job);
+  void run(int pieces, const std::function<void()>& job);
 
   const int wanted;  // the caller's among them
   std::vector<std::thread> others;
@@ -638,9 +638,9 @@ Crew::Threads::~Threads() {
   for (std::thread& other : others) other.join();
 }
 
-void Crew::Threads::start() {
+void Crew::Threads::start(int threads) {
   try {
-    for (int k = 1; k < wanted; ++k) others.emplace_back([this] { serve(); });
+    while (static_cast<int>(others.size()) + 1 < threads) others.emplace_back([this] { serve(); });
   } catch (const std::system_error&) {
     // no more threads to be had: those there are do it all
   }
@@ -664,8 +664,8 @@ void Crew::Threads::serve() {
   }
 }
 
-void Crew::Threads::run(const std::function<void()>& shared) {
-  if (others.empty()) start();
+void Crew::Threads::run(int pieces, const std::function<void()>& shared) {
+  start(std::min(wanted, pieces));
   {
     const std::lock_guard<std::mutex> lock(mutex);
     job = &shared;
@@ -716,7 +716,7 @@ void Crew::forPieces(int begin, int end, int size, const Task& task) const {
     }
   };
   if (pieces > 1 && threads_->wanted > 1)
-    threads_->run(work);
+    threads_->run(pieces, work);
   else
     work();
   if (failure) std::rethrow_exception(failure);

@@ -4,8 +4,10 @@
 #include <doctest/doctest.h>
 
 #include <algorithm>
+#include <chrono>
 #include <cstring>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include "shapes.hpp"
@@ -470,15 +472,18 @@ TEST_SUITE("3.7.4") {
         CHECK(std::count(times.begin(), times.end(), 1) == end - 3);
         CHECK(std::count(times.begin(), times.begin() + 3, 0) == 3);
       }
-      std::string thrown;
-      try {
-        crew.forPieces(0, 100, 1, [](int k, int, int) {
-          if (k >= 20) throw MethodError(std::to_string(k));
-        });
-      } catch (const MethodError& error) {
-        thrown = error.what();
+      for (int slow : {20, 21}) {  // the first to throw, and the last
+        std::string thrown;
+        try {
+          crew.forPieces(0, 100, 1, [slow](int k, int, int) {
+            if (k == slow) std::this_thread::sleep_for(std::chrono::milliseconds(2));
+            if (k >= 20) throw MethodError(std::to_string(k));
+          });
+        } catch (const MethodError& error) {
+          thrown = error.what();
+        }
+        CHECK(thrown == "20");
       }
-      CHECK(thrown == "20");
       crew.forPieces(0, 0, 1, [](int, int, int) { CHECK(false); });
     }
   }
