@@ -2252,7 +2252,7 @@ struct Jacobians {
 
 /// From the edges a, b, c of E^I and p_k of E^P: J = Σ p_k g_kᵀ with the gradients g_0 = b × c/det
 /// I and so on.
-Jacobians jacobiansOf(const EdgeBlock& ideal, const EdgeBlock& physical) {
+MECCANO_AVX2_TOO Jacobians jacobiansOf(const EdgeBlock& ideal, const EdgeBlock& physical) {
   Jacobians J;
   for (int i = 0; i < lanes; ++i) {
     const Vec3 a = ideal.edge(0, i), b = ideal.edge(1, i), c = ideal.edge(2, i), bc = cross(b, c);
