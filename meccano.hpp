@@ -111,10 +111,9 @@ bool solveCholesky(const Mat3& A, Vec3 b, Vec3& p);
 /// thread takes longer than most pieces do.
 class Crew {
  public:
-  /// Of so many threads, the caller's among them, but not more than the cores where these are above
-  /// 16; 0: of all cores. They start with the first loop that has a piece for them.
+  /// Of so many threads, the caller's among them (at most 16, or the cores where these are more);
+  /// 0: of all cores. They start with the first loop that has a piece for them.
   explicit Crew(int threads = 1);
-  Crew(Crew&&) noexcept;
   Crew& operator=(Crew&&) noexcept;
   ~Crew();
 

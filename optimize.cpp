@@ -694,7 +694,6 @@ int usefulThreads(int wanted) {
 }  // namespace
 
 Crew::Crew(int threads) : threads_(std::make_unique<Threads>(usefulThreads(threads))) {}
-Crew::Crew(Crew&&) noexcept = default;
 Crew& Crew::operator=(Crew&&) noexcept = default;
 Crew::~Crew() = default;
 
