@@ -3213,7 +3213,8 @@ struct SlideGuard {
         }
     bound.assign(faces.size(), 1e300);
   }
-  /// Whether node n may move there: no face beside it gets farther than allowed and worse.
+  /// Whether node n may move there: no face beside it gets farther than allowed and worse. Threads
+  /// may ask at the same time for nodes that share no element, hence no face.
   bool accept(int n, Vec3 x, Vec2 parameter);
 };
 

@@ -249,7 +249,8 @@ struct OptimizeOptions {
   std::vector<int> active = {};
   // [§2 choice] δ from each star's own σ, for meshes whose σ spans orders of magnitude
   bool starDelta = false;
-  // asked before a sliding node n moves to x at this parameter; false: it stays. Only reads M.
+  // Asked before a sliding node n moves to x at this parameter; false: it stays. Of M it may read
+  // what shares an element with n: other threads ask for other nodes at the same time.
   std::function<bool(int n, Vec3 x, Vec2 parameter)> accept = nullptr;
   std::function<void(const Sweep&)> onSweep = nullptr;  // called after each sweep
 

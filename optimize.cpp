@@ -1142,7 +1142,7 @@ void fillSheets(Smoother& S, const std::vector<SheetFace>& faces) {
 void hireCrew(Smoother& S) {
   constexpr int elementsPerThread = 500;  // fewer are not worth one
   const int useful = 1 + static_cast<int>(S.elements.size()) / elementsPerThread;
-  S.crew = Crew(S.options.accept ? 1 : std::min(usefulThreads(S.options.threads), useful));
+  S.crew = Crew(std::min(usefulThreads(S.options.threads), useful));
 }
 
 /// All that is known of the elements before the first sweep.

@@ -232,6 +232,19 @@ TEST_SUITE("2") {
     CHECK(shapes::sameMesh(M, before));
   }
 
+  TEST_CASE("Algorithm 1: the number of threads does not change a byte, where the guard is asked") {
+    Mesh one;
+    for (int threads : {1, 3}) {
+      MesherOptions options = withEps(.008);
+      options.optimize.threads = threads;
+      Mesh M;
+      const MesherReport r = meccanoMesher(M, solids::sphere(16), options);
+      REQUIRE(r.rounds > 0);
+      if (threads == 1) one = M;
+      CHECK(shapes::sameMesh(M, one));
+    }
+  }
+
   TEST_CASE("qualityOptimization: no face slides farther from the solid than the guard allows") {
     constexpr double eps = .04, guards[] = {3, 2, .8}, refined = 1;  // of eps: 1 before it slides
     Lines rounds;
