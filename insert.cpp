@@ -3439,6 +3439,9 @@ void checkOptions(const MesherOptions& options) {
   if (options.maxTets < 1 || options.maxTets > mostTets)
     throw InputError("meccanoMesher (§2): maxTets = " + std::to_string(options.maxTets) +
                      " must be from 1 to " + std::to_string(mostTets));
+  OptimizeOptions numbers = options.optimize;
+  numbers.fixed.clear(), numbers.active.clear();  // of nodes that are not there yet
+  checkOptions(numbers, 0);
 }
 
 }  // namespace
@@ -3446,7 +3449,6 @@ void checkOptions(const MesherOptions& options) {
 void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& report) {
   checkMeccano(M, "qualityOptimization (§2)");
   checkOptions(options);
-  checkOptions(options.optimize, M.x.size());
   Mesh work = M;
   Mesher W{work, options, report, curvedBoundary(M)};
   W.Omega.isFixed = options.fixedBoundary;
@@ -3459,7 +3461,6 @@ void qualityOptimization(Mesh& M, const MesherOptions& options, MesherReport& re
 MesherReport meccanoMesher(Mesh& M, const MesherOptions& options) {
   checkMeccano(M, "meccanoMesher (§2)");
   checkOptions(options);
-  checkOptions(options.optimize, M.x.size());
   MesherReport report;
   report.eps = options.eps;
   Mesh work = M;

@@ -221,6 +221,12 @@ TEST_SUITE("2") {
     MesherOptions few = withEps(.5);
     few.maxTets = 2000;
     CHECK(has(refusal(hill(), few), "above the limit of 2000; raise eps or the limit"));
+    MesherOptions negative = withEps(.05);
+    negative.optimize.threads = -1;
+    int lines = 0;
+    negative.onProgress = [&lines](const std::string&) { ++lines; };
+    CHECK(has(messageOf([&] { meccanoMesher(M, solids::sphere(8), negative); }), "threads = -1"));
+    CHECK(lines == 0);  // before any work
     Terrain high = hill();
     high.top = 150;
     CHECK(has(refusal(high, withEps(4)), "is not below the top 150; raise the top"));
