@@ -4515,6 +4515,7 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, co
     B.splits.clear();
     for (const auto& [E, level] : refine)
       if (B.M.level[E] == level) B.bisect(E);
+    const int before = static_cast<int>(cut.size());
     cut.resize(B.M.tets.size());
     changed.clear();
     // what is not cut has no parts that are, but where a midpoint was moved onto a surface
@@ -4523,10 +4524,11 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, co
       const Cut whole = cut[split.parent];
       const Cut part = isPart && whole.is == Cut::no ? whole : Cut{Cut::unknown, whole.triangle};
       cut[split.parent] = cut[split.child] = part;
-      changed.push_back(split.parent), changed.push_back(split.child);
+      if (split.parent < before) changed.push_back(split.parent);
     }
     std::sort(changed.begin(), changed.end());
     changed.erase(std::unique(changed.begin(), changed.end()), changed.end());
+    for (int E = before; E < static_cast<int>(cut.size()); ++E) changed.push_back(E);
   }
 }
 
@@ -5162,7 +5164,7 @@ namespace {
 /// What the squares of ∂T know of S: sides of their nodes, distances of their quarters.
 /// Quarter e of a square is the triangle of its corners e, e + 1 and its centre.
 struct Survey {
-  std::vector<signed char> side;  // [mesh nodes], +1 or −1, 0 off ∂T
+  std::vector<signed char> side;  // [mesh nodes], +1 or −1, 0 off ∂T; none of a middle layer
   std::vector<char> facesUp;      // [squares] of a middle layer, 1: the cube beyond is above S
   std::vector<char> free;         // [squares], 0: touches another surface, or lies beyond it
   std::vector<double> excess;     // [squares], tangential excess of the centre beyond the rim, in h
@@ -5197,38 +5199,37 @@ bool crossesAny(const TriangleTree& tree, const std::vector<Vec3>& x,
 
 Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
                      const Crew& crew) {
-  constexpr double reach = 4;          // of h: no square of ∂T is farther from S
-  constexpr double withSlack = 1.001;  // above the rounding of a bound
-  constexpr double deep = 8;           // of h, from the rim of S: no square there is ever removed
+  constexpr double reach = 4;  // of h: hardly a square of ∂T is farther from S
+  constexpr double deep = 8;   // of h, from the rim of S: no square there is ever removed
   const std::vector<std::array<int, 3>> earlier = facesAround(M, S, reach * Q.h);
   const TriangleTree tree(M.x, earlier);
   const std::size_t squares = Q.squares.size();
   Survey survey;
-  survey.side.assign(M.x.size(), 0);
+  survey.side.assign(Q.isMiddle ? 0 : M.x.size(), 0);
   survey.sharp.assign(M.x.size(), 0);
-  survey.free.resize(squares), survey.excess.resize(squares);
+  survey.free.resize(squares), survey.excess.assign(squares, 0);
   survey.beyond.assign(squares, {}), survey.above.assign(squares, {deep, deep, deep, deep});
   if (Q.isMiddle) survey.facesUp.resize(squares);
-  std::vector<double> distance(squares);  // of the centres
   const double perH = 1 / Q.h;
-  // no point is farther from S than the square's centre and the way to it
-  const auto queryNear = [&](int i, Vec3 x) {
-    return S.query(x, withSlack * (distance[i] + norm(x - Q.squares[i].centre)));
+  // whether a square's nearest point of S is deep inside of S, and nothing is in between
+  const auto isDeep = [&](Vec3 x) {
+    return triangleWithin(S.rimTree, x, (deep + reach) * Q.h) < 0 &&
+           triangleWithin(tree, x, reach * Q.h) < 0 && triangleWithin(S.tree, x, reach * Q.h) >= 0;
   };
   const auto surveySquare = [&](int i) {
     const Square& s = Q.squares[i];
-    const SurfaceQuery middle = S.query(s.centre);
-    distance[i] = middle.distance;
-    bool isFree = true;
-    for (int n : s.node) isFree &= M.dimension[n] == 3;
-    survey.free[i] = isFree && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
-    survey.excess[i] = perH * middle.excess;
     if (Q.isMiddle)
       survey.facesUp[i] = s.facesAbove || (!s.facesBelow && S.query(s.beyond).side >= 0);
+    survey.free[i] = true;
+    for (int n : s.node) survey.free[i] &= M.dimension[n] == 3;
+    if (isDeep(s.centre)) return;
+    const SurfaceQuery middle = S.query(s.centre);
+    survey.free[i] = survey.free[i] && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
+    survey.excess[i] = perH * middle.excess;
     if (triangleWithin(S.rimTree, middle.point, deep * Q.h) < 0) return;
     for (int e = 0; e < 4; ++e) {
       const SurfaceQuery near =
-          queryNear(i, (1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
+          S.query((1. / 3) * (M.x[s.node[e]] + M.x[s.node[(e + 1) % 4]] + s.centre));
       survey.beyond[i][e] = perH * near.excess;
       survey.above[i][e] = near.onRim ? 0 : perH * S.rimDistance(near.point);
     }
@@ -5236,11 +5237,10 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
   crew.forPieces(0, static_cast<int>(squares), queryPiece, [&](int, int from, int to) {
     for (int i = from; i < to; ++i) surveySquare(i);
   });
+  if (Q.isMiddle) return survey;
   crew.forPieces(0, static_cast<int>(Q.nodes.size()), queryPiece, [&](int, int from, int to) {
-    for (int j = from; j < to; ++j) {
-      const int n = Q.nodes[j];
-      survey.side[n] = queryNear(Q.around[Q.start[n]].first, M.x[n]).side >= 0 ? 1 : -1;
-    }
+    for (int j = from; j < to; ++j)
+      survey.side[Q.nodes[j]] = S.query(M.x[Q.nodes[j]]).side >= 0 ? 1 : -1;
   });
   return survey;
 }
