@@ -3995,19 +3995,19 @@ ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
   return best;
 }
 
-TriangleTree::TriangleTree(const std::vector<Vec3>& points,
+TriangleTree::TriangleTree(const std::vector<Vec3>& x,
                            const std::vector<std::array<int, 3>>& triangles)
     : triangle(triangles.size()) {
   std::vector<std::array<Vec3, 3>> all;
   std::vector<Vec3> centres;
   for (const std::array<int, 3>& t : triangles) {
-    all.push_back({points[t[0]], points[t[1]], points[t[2]]});
+    all.push_back({x[t[0]], x[t[1]], x[t[2]]});
     const Box box = boxOf(all.back());
     centres.push_back(.5 * (box.lo + box.hi));
   }
   std::iota(triangle.begin(), triangle.end(), 0);
   if (!all.empty()) buildTreeNode(*this, all, centres, 0, static_cast<int>(all.size()));
-  for (int t : triangle) corners.push_back(all[t]);
+  for (int t : triangle) corners.push_back(all[t]), points.push_back(triangles[t]);
 }
 
 ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
@@ -4072,8 +4072,8 @@ SurfaceDistance::SurfaceDistance(const TriangleSurface& cleaned)
   for (Vec3& n : vertexNormal) n = unitVector(n);
 }
 
-SurfaceQuery SurfaceDistance::query(Vec3 x, double within) const {
-  const ClosestPoint p = tree.closest(x, within);
+SurfaceQuery SurfaceDistance::query(Vec3 x) const {
+  const ClosestPoint p = tree.closest(x);
   SurfaceQuery q{p, faceNormal[p.triangle], 0, false, 0};
   if (p.feature == Feature::edge) {
     q.normal = edgeNormal[p.triangle][p.which];
@@ -4164,10 +4164,23 @@ bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
   return false;
 }
 
-/// Whether x is not farther than this from triangle i (in tree order).
+/// Whether x is not farther than this from triangle i (in tree order); without roots, and mostly
+/// without division.
 bool isNear(const TriangleTree& tree, int i, Vec3 x, double distance) {
+  constexpr double rounding = 1e-9;
   const std::array<Vec3, 3>& c = tree.corners[i];
-  return closestPointOnTriangle(x, c[0], c[1], c[2]).distance <= distance;
+  const Vec3 b1 = c[1] - c[0], b2 = c[2] - c[0], p = x - c[0], n = cross(b1, b2);
+  const double n2 = norm2(n), height = dot(p, n), far2 = distance * distance;
+  if (height * height > far2 * n2 * (1 + rounding)) return false;  // of the plane
+  const double w1 = dot(cross(p, b2), n), w2 = dot(cross(b1, p), n);  // the foot's, times n2
+  if (w1 > 0 && w2 > 0 && w1 + w2 < n2) return height * height <= far2 * n2;
+  for (int k = 0; k < 3; ++k) {
+    const Vec3 d = c[(k + 1) % 3] - c[k], q = x - c[k];
+    const double along = dot(q, d), length2 = norm2(d);
+    const double t = along <= 0 ? 0 : along >= length2 ? 1 : along / length2;
+    if (norm2(q - t * d) <= far2) return true;
+  }
+  return false;
 }
 
 /// A triangle (in tree order) that is not farther than this from x, the first one found; -1: none.
@@ -4203,6 +4216,7 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
     if (near >= 0) std::rotate(recent.begin(), recent.end() - 1, recent.end()), recent[0] = near;
     return near >= 0;
   };
+  KeyMap had(3 * (to - from) / 2);  // edge → steps of the lattice whose points on it were looked at
   for (int t = from; t < to; ++t) {
     const std::array<Vec3, 3>& c = A.corners[t];
     // the distance from one triangle is a convex function: on another one largest at a corner
@@ -4211,11 +4225,18 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
     if (isNearOne(c[0]) && isNearOne(c[1]) && isNearOne(c[2])) continue;
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
-    for (int i = 0; i <= m; ++i)
-      for (int j = 0; i + j <= m; ++j) {
-        const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
-        if (!findNear(p)) largest = {B.closest(p).distance, p};
-      }
+    const auto look = [&](int i, int j) {
+      const Vec3 p = (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
+      if (!findNear(p)) largest = {B.closest(p).distance, p};
+    };
+    for (int i = 1; i < m; ++i)
+      for (int j = 1; i + j < m; ++j) look(i, j);
+    for (int e = 0; e < 3; ++e) {  // the other triangle's points are the same
+      int& steps = had[edgeKey(A.points[t][e], A.points[t][(e + 1) % 3])];
+      for (int i = steps >= m ? m + 1 : 0; i <= m; ++i)
+        look(e == 0 ? i : e == 1 ? m - i : 0, e == 1 ? i : e == 2 ? m - i : 0);
+      steps = std::max(steps, m);
+    }
   }
   return largest;
 }
@@ -5199,8 +5220,9 @@ bool crossesAny(const TriangleTree& tree, const std::vector<Vec3>& x,
 
 Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S,
                      const Crew& crew) {
-  constexpr double reach = 4;  // of h: hardly a square of ∂T is farther from S
-  constexpr double deep = 8;   // of h, from the rim of S: no square there is ever removed
+  constexpr double reach = 4;   // of h: hardly a square of ∂T is farther from S
+  constexpr double beside = 2;  // of h: and few are that far
+  constexpr double deep = 8;    // of h, from the rim of S: no square there is ever removed
   const std::vector<std::array<int, 3>> earlier = facesAround(M, S, reach * Q.h);
   const TriangleTree tree(M.x, earlier);
   const std::size_t squares = Q.squares.size();
@@ -5213,8 +5235,9 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
   const double perH = 1 / Q.h;
   // whether a square's nearest point of S is deep inside of S, and nothing is in between
   const auto isDeep = [&](Vec3 x) {
-    return triangleWithin(S.rimTree, x, (deep + reach) * Q.h) < 0 &&
-           triangleWithin(tree, x, reach * Q.h) < 0 && triangleWithin(S.tree, x, reach * Q.h) >= 0;
+    return triangleWithin(S.rimTree, x, (deep + beside) * Q.h) < 0 &&
+           triangleWithin(tree, x, beside * Q.h) < 0 &&
+           triangleWithin(S.tree, x, beside * Q.h) >= 0;
   };
   const auto surveySquare = [&](int i) {
     const Square& s = Q.squares[i];

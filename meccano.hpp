@@ -645,6 +645,7 @@ struct TriangleTree {
   std::vector<Node> nodes;                   // depth first
   std::vector<int> triangle;                 // [triangles], input number, in tree order
   std::vector<std::array<Vec3, 3>> corners;  // [triangles], in tree order
+  std::vector<std::array<int, 3>> points;    // [triangles], their numbers
 
   TriangleTree() = default;
   TriangleTree(const std::vector<Vec3>& points, const std::vector<std::array<int, 3>>& triangles);
@@ -704,8 +705,7 @@ struct SurfaceDistance {
   std::vector<char> isRimPoint;                 // [points]
 
   explicit SurfaceDistance(const TriangleSurface& cleaned);
-  /// `within` must be above the distance from S: it saves search.
-  SurfaceQuery query(Vec3 x, double within = 1e300) const;
+  SurfaceQuery query(Vec3 x) const;
   double rimDistance(Vec3 x) const;  // distance to the rim polyline
 };
 
