@@ -337,17 +337,19 @@ std::vector<std::array<int, 3>> labelledFaces(const Mesh& M, Wanted wanted) {
   constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
   std::vector<std::array<int, 3>> faces;
   std::vector<std::pair<std::array<int, 3>, std::size_t>> inserted;  // sorted nodes, place in faces
-  for (std::size_t E = 0; E < M.faceLabel.size(); ++E)
+  for (std::size_t E = 0; E < M.faceLabel.size(); ++E) {
+    const std::array<int, 4>&labels = M.faceLabel[E], &z = M.tets[E];
+    if ((labels[0] | labels[1] | labels[2] | labels[3]) == 0) continue;  // most are inside
     for (int i = 0; i < 4; ++i) {
-      const int label = M.faceLabel[E][i];
+      const int label = labels[i];
       if (label == 0) continue;
-      const std::array<int, 4>& z = M.tets[E];
       std::array<int, 3> face{z[outward[i][0]], z[outward[i][1]], z[outward[i][2]]};
       if (!wanted(label, face)) continue;
       faces.push_back(face);
       std::sort(face.begin(), face.end());
       if (label > 0) inserted.push_back({face, faces.size() - 1});
     }
+  }
   std::sort(inserted.begin(), inserted.end());
   std::vector<char> isSecond(faces.size(), 0);
   for (std::size_t i = 1; i < inserted.size(); ++i)
@@ -3922,29 +3924,41 @@ void growBox(TriangleTree::Box& box, Vec3 p) {
   box.hi = {std::max(box.hi.x, p.x), std::max(box.hi.y, p.y), std::max(box.hi.z, p.z)};
 }
 
-/// Recursive median split of tree.triangle[first, last) along the longest side of the centres' box.
+/// A triangle's number and the centre of its box.
+struct Centre {
+  Vec3 at;
+  int triangle;
+};
+
+/// Recursive median split of centres[first, last) along the longest side of their box.
 void buildTreeNode(TriangleTree& tree, const std::vector<std::array<Vec3, 3>>& corners,
-                   const std::vector<Vec3>& centres, int first, int last) {
-  const auto order = tree.triangle.begin();
-  TriangleTree::Box box = boxOf(corners[order[first]]);
-  TriangleTree::Box middle{centres[order[first]], centres[order[first]]};
-  for (int i = first; i < last; ++i) {
-    for (Vec3 p : corners[order[i]]) growBox(box, p);
-    growBox(middle, centres[order[i]]);
+                   std::vector<Centre>& centres, int first, int last) {
+  const int self = static_cast<int>(tree.nodes.size());
+  if (last - first <= trianglesPerLeaf) {
+    TriangleTree::Box box = boxOf(corners[centres[first].triangle]);
+    for (int i = first; i < last; ++i)
+      for (Vec3 p : corners[centres[i].triangle]) growBox(box, p);
+    tree.nodes.push_back({box, first, last - first, -1});
+    return;
   }
-  const std::size_t self = tree.nodes.size();
-  const bool isLeaf = last - first <= trianglesPerLeaf;
-  tree.nodes.push_back({box, first, isLeaf ? last - first : 0, -1});
-  if (isLeaf) return;
+  TriangleTree::Box middle{centres[first].at, centres[first].at};
+  for (int i = first; i < last; ++i) growBox(middle, centres[i].at);
   const Vec3 d = middle.hi - middle.lo;
   double Vec3::*axis = d.x >= d.y && d.x >= d.z ? &Vec3::x : d.y >= d.z ? &Vec3::y : &Vec3::z;
   const int half = (first + last) / 2;
-  std::nth_element(order + first, order + half, order + last, [&](int a, int b) {
-    return std::make_pair(centres[a].*axis, a) < std::make_pair(centres[b].*axis, b);
-  });
+  std::nth_element(centres.begin() + first, centres.begin() + half, centres.begin() + last,
+                   [axis](const Centre& a, const Centre& b) {
+                     return std::make_pair(a.at.*axis, a.triangle) <
+                            std::make_pair(b.at.*axis, b.triangle);
+                   });
+  tree.nodes.push_back({});
   buildTreeNode(tree, corners, centres, first, half);
-  tree.nodes[self].right = static_cast<int>(tree.nodes.size());
+  const int right = static_cast<int>(tree.nodes.size());
   buildTreeNode(tree, corners, centres, half, last);
+  TriangleTree::Box box = tree.nodes[self + 1].box;
+  growBox(box, tree.nodes[right].box.lo);
+  growBox(box, tree.nodes[right].box.hi);
+  tree.nodes[self] = {box, first, 0, right};
 }
 
 /// Calls visit(i) for the triangles (in tree order) of leaves not farther from `box` than `bound`,
@@ -3996,18 +4010,19 @@ ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
 }
 
 TriangleTree::TriangleTree(const std::vector<Vec3>& x,
-                           const std::vector<std::array<int, 3>>& triangles)
-    : triangle(triangles.size()) {
+                           const std::vector<std::array<int, 3>>& triangles) {
   std::vector<std::array<Vec3, 3>> all;
-  std::vector<Vec3> centres;
+  std::vector<Centre> centres;
   for (const std::array<int, 3>& t : triangles) {
     all.push_back({x[t[0]], x[t[1]], x[t[2]]});
     const Box box = boxOf(all.back());
-    centres.push_back(.5 * (box.lo + box.hi));
+    centres.push_back({.5 * (box.lo + box.hi), static_cast<int>(centres.size())});
   }
-  std::iota(triangle.begin(), triangle.end(), 0);
   if (!all.empty()) buildTreeNode(*this, all, centres, 0, static_cast<int>(all.size()));
-  for (int t : triangle) corners.push_back(all[t]), points.push_back(triangles[t]);
+  for (const Centre& centre : centres) {
+    triangle.push_back(centre.triangle);
+    corners.push_back(all[centre.triangle]), points.push_back(triangles[centre.triangle]);
+  }
 }
 
 ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
@@ -4171,7 +4186,7 @@ bool isNear(const TriangleTree& tree, int i, Vec3 x, double distance) {
   const std::array<Vec3, 3>& c = tree.corners[i];
   const Vec3 b1 = c[1] - c[0], b2 = c[2] - c[0], p = x - c[0], n = cross(b1, b2);
   const double n2 = norm2(n), height = dot(p, n), far2 = distance * distance;
-  if (height * height > far2 * n2 * (1 + rounding)) return false;  // of the plane
+  if (height * height > far2 * n2 * (1 + rounding)) return false;     // of the plane
   const double w1 = dot(cross(p, b2), n), w2 = dot(cross(b1, p), n);  // the foot's, times n2
   if (w1 > 0 && w2 > 0 && w1 + w2 < n2) return height * height <= far2 * n2;
   for (int k = 0; k < 3; ++k) {
@@ -4493,6 +4508,30 @@ struct Cut {
   int triangle = -1;  // of S, which meets it or met its parent; -1: none is known
 };
 
+/// On which sides of a box a point is beyond it, six bits.
+unsigned sidesBeyond(const TriangleTree::Box& box, Vec3 p) {
+  return unsigned(p.x < box.lo.x) | unsigned(p.y < box.lo.y) << 1 | unsigned(p.z < box.lo.z) << 2 |
+         unsigned(p.x > box.hi.x) << 3 | unsigned(p.y > box.hi.y) << 4 |
+         unsigned(p.z > box.hi.z) << 5;
+}
+
+/// What is known at once: an element whose nodes are all beyond one side of the box of S is not
+/// cut.
+std::vector<Cut> cutsBeforeSearch(const Mesh& M, const SurfaceDistance& S) {
+  const TriangleTree::Box& box = S.tree.nodes[0].box;
+  const double wide = 1e-6 * norm(box.hi - box.lo);
+  const Vec3 margin{wide, wide, wide};
+  std::vector<unsigned char> beyond(M.x.size());
+  for (std::size_t n = 0; n < M.x.size(); ++n)
+    beyond[n] = static_cast<unsigned char>(sidesBeyond({box.lo - margin, box.hi + margin}, M.x[n]));
+  std::vector<Cut> cut(M.tets.size());
+  for (std::size_t E = 0; E < cut.size(); ++E) {
+    const std::array<int, 4>& z = M.tets[E];
+    if (beyond[z[0]] & beyond[z[1]] & beyond[z[2]] & beyond[z[3]]) cut[E].is = Cut::no;
+  }
+  return cut;
+}
+
 /// Whether S meets tetrahedron E: the triangle that is known, else candidates by the tree; by
 /// clipping.
 Cut cutBySurface(const Mesh& M, int E, const SurfaceDistance& S, int known) {
@@ -4639,7 +4678,7 @@ SizeChoice chooseSize(const Mesh& M, const SurfaceDistance& S) {
 
 Approximation volumetricApproximation(Bisection& B, const SurfaceDistance& S, double lc,
                                       const Crew& crew) {
-  std::vector<Cut> cut;
+  std::vector<Cut> cut = cutsBeforeSearch(B.M, S);
   refineCut(B, S, cut, crew, [&](int E) { return isTooLarge(B.M, E, lc); });  // eq. (1)
   Approximation A;
   A.level = cubeLevel(B.M, lc);
@@ -4666,8 +4705,13 @@ struct Lattice {
     constexpr std::uint64_t mask = (1u << 21) - 1;
     return {std::int64_t(key >> 42), std::int64_t(key >> 21 & mask), std::int64_t(key & mask)};
   }
-  std::int64_t inside(double c) const { return 2 * std::int64_t(std::floor(c * scale)) + 1; }
-  bool onPlane(double c) const { return c * scale == std::floor(c * scale); }
+  // ξ >= 0: the cut-off is the floor, without a call
+  Vec3 xiOf(std::uint64_t key) const {
+    const std::array<std::int64_t, 3> p = position(key);
+    return (.5 / scale) * Vec3{double(p[0]), double(p[1]), double(p[2])};
+  }
+  std::int64_t inside(double c) const { return 2 * std::int64_t(c * scale) + 1; }
+  bool onPlane(double c) const { return c * scale == double(std::int64_t(c * scale)); }
   std::uint64_t cubeOf(const Mesh& M, int E) const {
     const std::array<int, 4>& z = M.tets[E];
     const Vec3 c = .25 * (M.xi[z[0]] + M.xi[z[1]] + M.xi[z[2]] + M.xi[z[3]]);
@@ -4984,8 +5028,7 @@ bool holds(const Mesh& M, int E, Vec3 xi) {
 /// Refines the cube of 𝓣's lattice that has this mesh node: all elements that meet it hold its
 /// centre.
 void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
-  const std::array<std::int64_t, 3> p = Lattice::position(cube);
-  const Vec3 centre = (.5 / Lattice(level).scale) * Vec3{double(p[0]), double(p[1]), double(p[2])};
+  const Vec3 centre = Lattice(level).xiOf(cube);
   std::vector<int> around;
   for (bool coarse = true; coarse;) {  // one level a round at least
     coarse = false;
@@ -5045,12 +5088,19 @@ Approximation middleApproximation(Bisection& B, const Approximation& A, const Su
   Approximation middle;
   middle.level = A.level, middle.isMiddle = true, middle.above = cubes.above,
   middle.below = cubes.below;
+  const Lattice lattice(A.level);
   KeyMap isTouching(cubes.touching.size());
-  for (std::uint64_t cube : cubes.touching) isTouching[cube] = 1;
+  TriangleTree::Box around{{beyondAll, beyondAll, beyondAll}, {-beyondAll, -beyondAll, -beyondAll}};
+  for (std::uint64_t cube : cubes.touching) {
+    isTouching[cube] = 1;
+    for (int k : {0, 7}) growBox(around, lattice.xiOf(cornerOf(cube, k)));
+  }
   middle.T.assign(B.M.tets.size(), 0);
-  for (std::size_t E = 0; E < middle.T.size(); ++E)
-    if (B.M.level[E] >= A.level)
-      middle.T[E] = isTouching.get(Lattice(A.level).cubeOf(B.M, static_cast<int>(E))) > 0;
+  for (std::size_t E = 0; E < middle.T.size(); ++E) {
+    const Vec3 corner = B.M.xi[B.M.tets[E][0]];
+    if (B.M.level[E] >= A.level && boxesMeet(around, corner, corner))  // most are elsewhere
+      middle.T[E] = isTouching.get(lattice.cubeOf(B.M, static_cast<int>(E))) > 0;
+  }
   return middle;
 }
 
@@ -5222,7 +5272,7 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
                      const Crew& crew) {
   constexpr double reach = 4;   // of h: hardly a square of ∂T is farther from S
   constexpr double beside = 2;  // of h: and few are that far
-  constexpr double deep = 8;    // of h, from the rim of S: no square there is ever removed
+  constexpr double deep = 4;    // of h, from the rim of S: no square there is ever removed
   const std::vector<std::array<int, 3>> earlier = facesAround(M, S, reach * Q.h);
   const TriangleTree tree(M.x, earlier);
   const std::size_t squares = Q.squares.size();
@@ -5789,13 +5839,14 @@ namespace {
 /// S_M as a complex: its nodes, edges and rim, read off the labelled faces of some elements.
 struct SurfaceComplex {
   std::vector<char> node;  // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
-  KeyMap edges;            // edge → times seen (twice a face): 2 rim, 4 inside
+  KeyMap edges;            // edge → faces there: 1 rim, 2 inside
   std::vector<std::pair<int, int>> edgeList;
-  SurfaceComplex(const Mesh& M, int k, const std::vector<int>& elements) : node(M.x.size(), 0) {
+  SurfaceComplex(const Bisection& B, int k, const std::vector<int>& elements)
+      : node(B.M.x.size(), 0), edges(elements.size() / 8) {
     for (int E : elements)
       for (int i = 0; i < 4; ++i) {
-        if (M.faceLabel[E][i] != k) continue;
-        const std::array<int, 3> v = faceOpposite(M.tets[E], i);
+        if (B.M.faceLabel[E][i] != k || B.neighbour[E][i] < E) continue;  // once a face
+        const std::array<int, 3> v = faceOpposite(B.M.tets[E], i);
         for (int e = 0; e < 3; ++e) {
           node[v[e]] = 1;
           if (edges[edgeKey(v[e], v[(e + 1) % 3])]++ == 0)
@@ -5810,7 +5861,7 @@ struct SurfaceComplex {
     return (node[z[0]] > 0) + (node[z[1]] > 0) + (node[z[2]] > 0) + (node[z[3]] > 0);
   }
   bool isEdge(int a, int b) const { return edges.get(edgeKey(a, b)) > 0; }
-  bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 2; }
+  bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 1; }
 };
 
 constexpr int tetEdges[6][2] = {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}};
@@ -5849,7 +5900,7 @@ bool refineTetrahedraWithTwoFaces(Bisection& B, int k, const std::vector<int>& n
 }
 
 bool refineFacesWithTwoRimEdges(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B.M, k, near);
+  const SurfaceComplex SM(B, k, near);
   std::vector<std::pair<int, int>> refine;
   for (int E : near)
     for (int i = 0; i < 4 && SM.count(B.M.tets[E]) > 2; ++i) {
@@ -5863,7 +5914,7 @@ bool refineFacesWithTwoRimEdges(Bisection& B, int k, const std::vector<int>& nea
 }
 
 bool refineEdgesAcrossTheRim(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B.M, k, near);
+  const SurfaceComplex SM(B, k, near);
   std::vector<std::pair<int, int>> refine;
   for (const auto& [a, b] : SM.edgeList)
     if (SM.node[a] == 2 && SM.node[b] == 2 && !SM.isRimEdge(a, b)) refine.push_back({a, b});
@@ -5871,7 +5922,7 @@ bool refineEdgesAcrossTheRim(Bisection& B, int k, const std::vector<int>& near) 
 }
 
 bool refineEdgesBetweenSurfaces(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B.M, k, near);
+  const SurfaceComplex SM(B, k, near);
   std::vector<std::pair<int, int>> refine;
   for (int E : near)
     for (const auto& e : tetEdges) {
@@ -5884,7 +5935,7 @@ bool refineEdgesBetweenSurfaces(Bisection& B, int k, const std::vector<int>& nea
 }
 
 bool refineToFullSubcomplex(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B.M, k, near);
+  const SurfaceComplex SM(B, k, near);
   std::vector<std::pair<int, int>> refine;
   for (int E : near) {
     const std::array<int, 4>& z = B.M.tets[E];
@@ -6871,7 +6922,8 @@ struct Layer {
 
 /// The state of an insertion. The caller's mesh stays as it is.
 struct Insertion {
-  const Mesh& original;  // the caller's
+  const Mesh& original;          // the caller's
+  const std::vector<double>& q;  // of its elements
   const SurfaceDistance& S;
   const InsertOptions& options;
   const Crew& crew;
@@ -7137,14 +7189,14 @@ int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {
 bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertReport& report) {
   const int rounds = labelAndHeal(I, way, M);
   report.way = I.ways;
-  report.refined = qualityStatistics(M);
+  report.refined = qualityStatistics(qualities(M, I.original, I.q));
   I.stage("surfaceHealed", M);
   I.progress("3.5 surface healing: " + std::to_string(rounds) + " rounds, " +
              std::to_string(M.tets.size()) + " tetrahedra (" + describe(way) + ")");
   if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S, I.crew);
   const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim, I.crew);
   report.tangentialShift = projection.tangentialShift;
-  report.projected = qualityStatistics(M);
+  report.projected = qualityStatistics(qualities(M, I.original, I.q));
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
   optimizeAround(M, I, patient, nodesNear(M, I.k), report);
@@ -7642,16 +7694,16 @@ void checkApart(const Mesh& M, const std::vector<Candidate>& all) {
 }
 
 /// 3.2 to 3.7 for one surface, at the sizes that are to be tried.
-///   original  the statistics of M
+///   q  of M's elements
 InsertReport insertCandidate(Mesh& M, const Candidate& candidate, const InsertOptions& options,
-                             const QualityStatistics& original, const Crew& crew) {
+                             const std::vector<double>& q, const Crew& crew) {
   const SurfaceDistance& cleaned = candidate.S;
   InsertReport report;
-  report.original = original;
+  report.original = qualityStatistics(q);
 
   SizeChoice chosen;
-  Insertion I{
-      M, cleaned, options, crew, static_cast<int>(M.surfaces.size()) + 1, candidate.crosses};
+  const int k = static_cast<int>(M.surfaces.size()) + 1;
+  Insertion I{M, q, cleaned, options, crew, k, candidate.crosses};
   if (options.lc == 0 && options.tolerance == 0) {
     chosen = chooseSize(M, cleaned);
     I.progress("3.2 l_c = " + number(chosen.lc) + " chosen: " + describe(chosen));
@@ -7686,14 +7738,15 @@ void largestFirst(std::vector<Candidate>& all) {
                    [&](const Candidate& a, const Candidate& b) { return key(a) < key(b); });
 }
 
-/// What an insertion asks of the mesh and the options before it looks at a surface. Returns the
-/// statistics of M.
-QualityStatistics checkStart(const Mesh& M, const InsertOptions& options) {
+/// What an insertion asks of the mesh and the options before it looks at a surface. Returns q of
+/// the elements.
+std::vector<double> checkStart(const Mesh& M, const InsertOptions& options) {
   checkMeccano(M, "insertSurface (§3.1)");
   checkOptions(options, M.x.size());
-  const QualityStatistics q = qualityStatistics(M);
-  if (q.inverted > 0)
-    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(q.inverted) +
+  const std::vector<double> q = qualities(M);
+  const auto inverted = std::count(q.begin(), q.end(), 0.);
+  if (inverted > 0)
+    throw InputError("insertSurface (§3.1): the mesh has " + std::to_string(inverted) +
                      " inverted elements; untangle it first (optimizeMesh)");
   return q;
 }
@@ -7701,16 +7754,16 @@ QualityStatistics checkStart(const Mesh& M, const InsertOptions& options) {
 }  // namespace
 
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
-  const QualityStatistics original = checkStart(M, options);
+  const std::vector<double> q = checkStart(M, options);
   const Crew crew(options.optimize.threads);
   const Candidate one = candidateOf(S, "", {}, crew);
   checkApart(M, {one});
-  return insertCandidate(M, one, options, original, crew);
+  return insertCandidate(M, one, options, q, crew);
 }
 
 std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurface>& S,
                                          const InsertOptions& options) {
-  QualityStatistics q = checkStart(M, options);
+  std::vector<double> q = checkStart(M, options);
   const Crew crew(options.optimize.threads);
   std::vector<Candidate> all = candidatesOf(S, crew);
   checkApart(M, all);
@@ -7720,7 +7773,7 @@ std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurf
   for (const Candidate& one : all) {
     reports.push_back(
         labelled(one.label, [&] { return insertCandidate(result, one, options, q, crew); }));
-    q = reports.back().smoothed;
+    q = qualities(result);
   }
   for (std::size_t i = 0; i + 1 < all.size();
        ++i)  // later ones have refined and moved earlier ones

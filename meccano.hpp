@@ -1053,8 +1053,12 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options = {});
 /// tetrahedron (where M has no computational coordinates, always).
 enum class Ideal { computational, regular };
 QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal = Ideal::computational);
+QualityStatistics qualityStatistics(const std::vector<double>& q);
 /// q of each tetrahedron. [tets]
 std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational);
+/// The same where M was made of `before`, whose q are given: computed anew for tetrahedra with
+/// other nodes or places only.
+std::vector<double> qualities(const Mesh& M, const Mesh& before, std::vector<double> q);
 
 // ==== 3. Surface insertion ======================================================================
 

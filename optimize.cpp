@@ -2265,58 +2265,99 @@ MECCANO_AVX2_TOO Jacobians jacobiansOf(const EdgeBlock& ideal, const EdgeBlock& 
   return J;
 }
 
-/// use(q) for each element of the mesh, in order. [eq. (7)]
-template <class Use>
-void forQualities(const Mesh& M, Ideal ideal, const Use& use) {
+/// use(E, q) for each of `count` elements E = element(0), element(1), ... in turn. [eq. (7)]
+template <class Element, class Use>
+void forQualities(const Mesh& M, Ideal ideal, std::size_t count, const Element& element,
+                  const Use& use) {
   const IdealElements ideals(M, ideal);
-  const int tets = static_cast<int>(M.tets.size());
   EdgeBlock I{}, P{};
-  for (int first = 0; first < tets; first += lanes) {
-    const int count = std::min(lanes, tets - first);
-    for (int i = 0; i < count; ++i) {
-      I.set(i, ideals.of(first + i));
-      P.set(i, cornersOf(M.x, M.tets[first + i]));
+  for (std::size_t first = 0; first < count; first += lanes) {
+    const int inBlock = static_cast<int>(std::min<std::size_t>(lanes, count - first));
+    for (int i = 0; i < inBlock; ++i) {
+      const int E = element(first + i);
+      I.set(i, ideals.of(E));
+      P.set(i, cornersOf(M.x, M.tets[E]));
     }
     const Jacobians J = jacobiansOf(I, P);
     const Distortions at = distortionsOf(J, 0, plainEta);
-    for (int i = 0; i < count; ++i) {
-      const int E = first + i;
+    for (int i = 0; i < inBlock; ++i) {
+      const int E = element(first + i);
       const bool inRange = J.sigma[i] > leastH && J.sigma[i] < 1 / leastH && J.N[i] < 1 / leastH;
-      use(inRange ? 1 / at.eta[i] : quality(jacobian(ideals.of(E), cornersOf(M.x, M.tets[E]))));
+      use(E, inRange ? 1 / at.eta[i] : quality(jacobian(ideals.of(E), cornersOf(M.x, M.tets[E]))));
     }
   }
 }
 
+template <class Use>
+void forQualities(const Mesh& M, Ideal ideal, const Use& use) {
+  const auto each = [](std::size_t E) { return static_cast<int>(E); };
+  forQualities(M, ideal, M.tets.size(), each, use);
+}
+
+/// Table I's row, of one q after the other.
+class Statistics {
+ public:
+  void add(double q) {
+    const int last = static_cast<int>(table_.histogram.size()) - 1;
+    if (q == 0) ++table_.inverted;
+    if (table_.tetrahedra++ == 0 || q < table_.min) table_.min = q;
+    table_.max = std::max(table_.max, q);
+    table_.mean += q;
+    squares_ += (1 - q) * (1 - q);
+    ++table_.histogram[std::clamp(static_cast<int>(20 * q), 0, last)];
+  }
+  QualityStatistics table() const {
+    QualityStatistics table = table_;
+    if (table.tetrahedra == 0) return table;
+    const double count = table.tetrahedra;
+    table.mean /= count;
+    // in one pass, from 1: rounding leaves some 1e-8 where all q are equal
+    const double fromMean = squares_ / count - (1 - table.mean) * (1 - table.mean);
+    table.stdDev = std::sqrt(std::max(0., fromMean));
+    return table;
+  }
+
+ private:
+  QualityStatistics table_;
+  double squares_ = 0;
+};
+
 }  // namespace
 
 std::vector<double> qualities(const Mesh& M, Ideal ideal) {
-  std::vector<double> q;
-  q.reserve(M.tets.size());
-  forQualities(M, ideal, [&q](double value) { q.push_back(value); });
-  return q;
+  std::vector<double> all(M.tets.size());
+  forQualities(M, ideal, [&all](int E, double q) { all[E] = q; });
+  return all;
+}
+
+std::vector<double> qualities(const Mesh& M, const Mesh& before, std::vector<double> all) {
+  std::vector<char> isOld(M.x.size(), 0);
+  for (std::size_t n = 0; n < std::min(M.x.size(), before.x.size()); ++n)
+    isOld[n] = M.x[n] == before.x[n];
+  std::vector<int> changed;
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    const std::array<int, 4>& z = M.tets[E];
+    const bool isSame = E < before.tets.size() && isOld[z[0]] && isOld[z[1]] && isOld[z[2]] &&
+                        isOld[z[3]] && z == before.tets[E];
+    if (!isSame) changed.push_back(static_cast<int>(E));
+  }
+  all.resize(M.tets.size());
+  forQualities(
+      M, Ideal::computational, changed.size(), [&](std::size_t i) { return changed[i]; },
+      [&all](int E, double q) { all[E] = q; });
+  return all;
+}
+
+QualityStatistics qualityStatistics(const std::vector<double>& all) {
+  Statistics statistics;
+  for (double q : all) statistics.add(q);
+  return statistics.table();
 }
 
 QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal) {
-  QualityStatistics table;
-  table.tetrahedra = static_cast<int>(M.tets.size());
-  if (M.tets.empty()) return table;
-  const int last = static_cast<int>(table.histogram.size()) - 1;
-  double squares = 0;
-  table.min = 1;
-  forQualities(M, ideal, [&](double q) {
-    if (q == 0) ++table.inverted;
-    table.min = std::min(table.min, q);
-    table.max = std::max(table.max, q);
-    table.mean += q;
-    squares += (1 - q) * (1 - q);
-    ++table.histogram[std::clamp(static_cast<int>(20 * q), 0, last)];
-  });
-  const double count = static_cast<double>(M.tets.size());
-  table.mean /= count;
-  // in one pass, from 1: rounding leaves some 1e-8 where all q are equal
-  const double fromMean = squares / count - (1 - table.mean) * (1 - table.mean);
-  table.stdDev = std::sqrt(std::max(0., fromMean));
-  return table;
+  Statistics statistics;
+  forQualities(M, ideal, [&](int, double q) { statistics.add(q); });
+  return statistics.table();
 }
 
 }  // namespace meccano

@@ -113,6 +113,26 @@ TEST_SUITE("Table I") {
     CHECK(qualityStatistics(M).min == doctest::Approx(table.min).epsilon(1e-13));
   }
 
+  TEST_CASE("Table I: q of a bisected and moved mesh from those before") {
+    const Mesh before = boxMesh({0, 0, 0}, {1, 1, 1}, {3, 3, 3});
+    const std::vector<double> q = qualities(before);
+    Mesh M = before;
+    bisect(M, {5, 80});
+    M.x[21] += {.05, -.02, .04};
+    std::size_t other = 0;  // whose q is anew
+    const std::vector<double> after = qualities(M, before, q);
+    REQUIRE(after.size() == M.tets.size());
+    for (std::size_t E = 0; E < q.size(); ++E) other += after[E] != q[E];
+    CHECK(M.tets.size() > before.tets.size());
+    CHECK(other > 10);
+    CHECK(other < 40);
+    CHECK(after == qualities(M));
+    CHECK(qualityStatistics(after).mean == qualityStatistics(M).mean);
+    // what has the nodes and places of before is not computed
+    CHECK(qualities(M, M, std::vector<double>(M.tets.size(), .25)) ==
+          std::vector<double>(M.tets.size(), .25));
+  }
+
   TEST_CASE("Table I: no elements, all zero") {
     const QualityStatistics table = qualityStatistics(Mesh{});
     CHECK(table.tetrahedra == 0);
