@@ -11,6 +11,7 @@
 //   Pictures         the mesh behind a cut, and the histogram of its quality, as SVG
 //   Commands         box, terrain, solid, insert, optimize, stats, picture, convert
 //   Arguments        options, help, exit status: 0 done and valid, 1 an error, 2 wrong usage
+#include <signal.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -69,6 +70,23 @@ bool isDevice(const fs::path& path) {
 [[noreturn]] void failWriting(const std::string& path, const std::string& why) {
   fail(path + ": cannot be written (" + why + "); nothing was written, choose another output");
 }
+
+/// While it lives an interrupt (Ctrl-C, kill) waits, so that no file is left half-written.
+class HoldInterrupts {
+ public:
+  HoldInterrupts() {
+    sigset_t held;
+    sigemptyset(&held);
+    for (int signal : {SIGINT, SIGTERM, SIGHUP}) sigaddset(&held, signal);
+    pthread_sigmask(SIG_BLOCK, &held, &before_);
+  }
+  HoldInterrupts(const HoldInterrupts&) = delete;
+  HoldInterrupts& operator=(const HoldInterrupts&) = delete;
+  ~HoldInterrupts() { pthread_sigmask(SIG_SETMASK, &before_, nullptr); }
+
+ private:
+  sigset_t before_;
+};
 
 /// A file beside its target with a name of its own. It disappears again unless it is put in place.
 class Temporary {
@@ -129,7 +147,9 @@ void writeDevice(const std::string& path, const std::string& text) {
 
 /// Tells before a long computation whether its result can be written; leaves nothing behind.
 void checkWritable(const std::string& path) {
-  if (!isDevice(path)) Temporary probe(path);
+  if (isDevice(path)) return;
+  const HoldInterrupts hold;
+  const Temporary probe(path);
 }
 
 struct Output {
@@ -138,6 +158,9 @@ struct Output {
 
 /// Writes all or none: each file beside its target first, renamed when every one is complete.
 void writeFiles(const std::vector<Output>& outputs) {
+  std::unique_ptr<HoldInterrupts> hold;  // not for a pipe, which may never be read
+  if (std::none_of(outputs.begin(), outputs.end(), [](auto& o) { return isDevice(o.path); }))
+    hold = std::make_unique<HoldInterrupts>();
   std::vector<std::unique_ptr<Temporary>> files;
   for (const Output& o : outputs) {
     if (isDevice(o.path)) continue;
@@ -832,8 +855,9 @@ std::vector<TriangleSurface> parseSurfaces(const std::string& path, const std::s
   if (isMesh(f))
     fail(path + ": this is a mesh (" + nameOf(f) + "), and a surface is needed; name a surface");
   if (f == Format::none)
-    fail(path + ": its content is of no known format; surfaces are read from OBJ, OFF, STL, PLY " +
-         "(ASCII, little-endian) and GOCAD TSurf files");
+    fail(
+        path + (text.empty() ? ": the file is empty" : ": its content is of no known format") +
+        "; surfaces are read from OBJ, OFF, STL, PLY (ASCII, little-endian) and GOCAD TSurf files");
   std::vector<TriangleSurface> all;
   for (const TriangleSurface& S : raw) {
     const std::size_t before = notes.size();
@@ -3955,6 +3979,7 @@ int run(const std::vector<std::string>& words, const Streams& io) {
 
 #ifndef MECCANO_NO_MAIN
 int main(int argc, char** argv) {
+  ::signal(SIGXFSZ, SIG_IGN);  // a file above the limit is an error of its write()
   const meccano::app::Streams io{std::cout, std::cerr, ::isatty(2) == 1};
   return meccano::app::run({argv + (argc > 0), argv + argc}, io);
 }

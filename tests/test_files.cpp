@@ -3,6 +3,7 @@
 // main.cpp: the readers and writers of all formats, atomic output, and the command line.
 #include <doctest/doctest.h>
 
+#include <csignal>
 #include <fstream>
 #include <numeric>
 #include <set>
@@ -411,6 +412,24 @@ TEST_SUITE("files") {
                  "TEXTURE_COORDINATES t 2 float\n0 0\nFIELD FieldData 1\nq 1 1 double\n1\n");
     CHECK(M.x.size() == 4);
     CHECK(M.tets.size() == 1);
+  }
+
+  TEST_CASE("output: an interrupt waits while a file is written") {
+    static volatile std::sig_atomic_t interrupts;
+    interrupts = 0;
+    const auto old = std::signal(SIGINT, [](int) { interrupts = interrupts + 1; });
+    Folder folder;
+    {
+      const HoldInterrupts hold;
+      std::raise(SIGINT);
+      Temporary file(folder / "a.vtk");
+      file.write("text");
+      CHECK(interrupts == 0);
+      file.putInPlace();
+    }
+    CHECK(interrupts == 1);
+    CHECK(folder.files() == 1);
+    std::signal(SIGINT, old);
   }
 
   TEST_CASE("output: a file is written whole or not at all, and nothing else is left") {
