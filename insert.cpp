@@ -4246,7 +4246,8 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
     };
     for (int i = 1; i < m; ++i)
       for (int j = 1; i + j < m; ++j) look(i, j);
-    for (int e = 0; e < 3; ++e) {  // the other triangle's points are the same
+    // of edge e from corner e on; those of the triangle beyond it are the same
+    for (int e = 0; e < 3; ++e) {
       int& steps = had[edgeKey(A.points[t][e], A.points[t][(e + 1) % 3])];
       for (int i = steps >= m ? m + 1 : 0; i <= m; ++i)
         look(e == 0 ? i : e == 1 ? m - i : 0, e == 1 ? i : e == 2 ? m - i : 0);
@@ -4705,11 +4706,11 @@ struct Lattice {
     constexpr std::uint64_t mask = (1u << 21) - 1;
     return {std::int64_t(key >> 42), std::int64_t(key >> 21 & mask), std::int64_t(key & mask)};
   }
-  // ξ >= 0: the cut-off is the floor, without a call
   Vec3 xiOf(std::uint64_t key) const {
     const std::array<std::int64_t, 3> p = position(key);
     return (.5 / scale) * Vec3{double(p[0]), double(p[1]), double(p[2])};
   }
+  // ξ >= 0: the integer part is the floor, without a call
   std::int64_t inside(double c) const { return 2 * std::int64_t(c * scale) + 1; }
   bool onPlane(double c) const { return c * scale == double(std::int64_t(c * scale)); }
   std::uint64_t cubeOf(const Mesh& M, int E) const {

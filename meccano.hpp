@@ -645,7 +645,7 @@ struct TriangleTree {
   std::vector<Node> nodes;                   // depth first
   std::vector<int> triangle;                 // [triangles], input number, in tree order
   std::vector<std::array<Vec3, 3>> corners;  // [triangles], in tree order
-  std::vector<std::array<int, 3>> points;    // [triangles], their numbers
+  std::vector<std::array<int, 3>> points;    // [triangles], numbers of the corners
 
   TriangleTree() = default;
   TriangleTree(const std::vector<Vec3>& points, const std::vector<std::array<int, 3>>& triangles);
