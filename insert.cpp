@@ -4805,12 +4805,15 @@ std::vector<int> elementsOf(const std::vector<char>& T) {
   return elements;
 }
 
+constexpr int tetsPerCube = 6;  // at least
+
 /// For each lattice node of T the cubes of T around it: bit 1 x+, bit 2 y+, bit 4 z+ of the cube's
 /// place.
 KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint64_t>& nodes) {
   const Lattice lattice(A.level);
-  KeyMap cubes, at;
-  for (int E : elementsOf(A.T)) {
+  const std::vector<int> elements = elementsOf(A.T);
+  KeyMap cubes(elements.size() / tetsPerCube), at(elements.size() / 3);
+  for (int E : elements) {
     const std::uint64_t key = lattice.cubeOf(M, E);
     if (cubes[key]++) continue;
     const std::array<std::int64_t, 3> p = Lattice::position(key);
@@ -4853,6 +4856,8 @@ void addElementsAt(Bisection& B, Approximation& A, int node) {
 
 void volumetricHealing(Bisection& B, Approximation& A) {
   constexpr int maxRounds = 200;
+  std::array<bool, 256> isDisk;
+  for (unsigned mask = 0; mask < isDisk.size(); ++mask) isDisk[mask] = isLocalDisk(mask);
   completeCubes(B, A, elementsOf(A.T));
   const Lattice lattice(A.level);
   for (int round = 0; round < maxRounds; ++round) {
@@ -4864,7 +4869,7 @@ void volumetricHealing(Bisection& B, Approximation& A) {
         if (lattice.isNode(B.M.xi[n])) meshNode[lattice.node(B.M.xi[n])] = n;
     std::vector<int> bad;
     for (std::uint64_t key : keys)
-      if (!isLocalDisk(cubes.get(key))) bad.push_back(meshNode.get(key));
+      if (!isDisk[cubes.get(key)]) bad.push_back(meshNode.get(key));
     if (bad.empty()) return;
     for (int n : bad) {
       if (isOnBoundary(B.M, n))
@@ -4888,8 +4893,10 @@ struct Cubes {
   std::vector<Vec3> centres;        // physical, of the elements' mean
   Cubes(const Mesh& M, const Approximation& A) {
     const Lattice lattice(A.level);
-    std::vector<int> elements;
-    for (int E : elementsOf(A.T)) {
+    const std::vector<int> ofT = elementsOf(A.T);
+    number = KeyMap(ofT.size() / tetsPerCube);
+    std::vector<int> elements;  // of each cube
+    for (int E : ofT) {
       const std::uint64_t key = lattice.cubeOf(M, E);
       int& n = number[key];
       if (n == 0) {
@@ -5008,8 +5015,9 @@ std::uint64_t cornerOf(std::uint64_t cube, int corner) {
 /// The lattice nodes of 𝓣: place → 1 + mesh node.
 KeyMap nodesOf(const Mesh& M, const Approximation& A) {
   const Lattice lattice(A.level);
-  KeyMap meshNode;
-  for (int E : elementsOf(A.T))
+  const std::vector<int> elements = elementsOf(A.T);
+  KeyMap meshNode(elements.size() / 3);
+  for (int E : elements)
     for (int n : M.tets[E])
       if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
   return meshNode;
@@ -5059,7 +5067,7 @@ DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDist
   const Cubes cubes(B.M, layer);
   const std::vector<char> isAbove = minimumCut(graphOf(B.M, layer, cubes, S, perDistance, crew));
   DividedCubes divided;
-  KeyMap cornersAbove;
+  KeyMap cornersAbove(isAbove.size());
   for (std::size_t c = 0; c < isAbove.size(); ++c) {
     if (isAbove[c]) divided.above.push_back(cubes.keys[c]);
     for (int k = 0; k < 8 && isAbove[c]; ++k) cornersAbove[cornerOf(cubes.keys[c], k)] = 1;
@@ -5861,7 +5869,7 @@ struct SurfaceComplex {
   int count(const std::array<int, 4>& z) const {
     return (node[z[0]] > 0) + (node[z[1]] > 0) + (node[z[2]] > 0) + (node[z[3]] > 0);
   }
-  bool isEdge(int a, int b) const { return edges.get(edgeKey(a, b)) > 0; }
+  bool isEdge(int a, int b) const { return node[a] && node[b] && edges.get(edgeKey(a, b)) > 0; }
   bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 1; }
 };
 
