@@ -258,6 +258,30 @@ TEST_SUITE("3.4") {
   }
 
   TEST_CASE(
+      "extraction: squares beyond an earlier surface are never chosen, deep inside of S too") {
+    const auto sheet = [](double z, double lo, double hi) {
+      TriangleSurface S;
+      S.points = {{lo, lo, z}, {hi, lo, z}, {hi, hi, z}, {lo, hi, z}};
+      S.triangles = {{0, 1, 2}, {0, 2, 3}};
+      return S;
+    };
+    Mesh M = boxMesh({0, 0, 0}, {22, 22, 4}, {22, 22, 4});
+    InsertOptions options;
+    options.lc = .9;
+    insertSurface(M, sheet(2.45, 2, 20), options);
+    Steps I(M, sheet(2.75, 3, 19));
+    I.approximate(1.8);  // cubes from z = 2 to 3: the earlier surface is inside
+    I.heal();
+    const Extraction above = surfaceExtraction(I.M, I.Q, I.S, 1, Outline::squares);
+    CHECK(above.fault == "");
+    CHECK(std::count(above.selected.begin(), above.selected.end(), 15) > 200);
+    const Extraction below = surfaceExtraction(I.M, I.Q, I.S, -1, Outline::squares);
+    CHECK(below.isBlocked);
+    CHECK(std::count(below.selected.begin(), below.selected.end(), 0) ==
+          static_cast<int>(below.selected.size()));
+  }
+
+  TEST_CASE(
       "the middle: squares between cubes above and below, about half as far from S as the sides") {
     double ofMiddle = 0, ofSides = 0;  // mean distances, summed over the cases
     for (const Try& t : tries()) {
