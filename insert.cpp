@@ -2393,7 +2393,6 @@ int Bisection::addMidpoint(int a, int b, const std::vector<int>& around) {
 
 void Bisection::bisectRing(const std::vector<int>& around) {
   const int a = M.tets[around[0]][0], b = M.tets[around[0]][1];
-  for (int t : around) keepForUndo(t);
   const int m = addMidpoint(a, b, around), first = static_cast<int>(M.tets.size());
   // The child of ring tetrahedron t at end node `end`: child 0 keeps the index, child 1 is
   // appended.
@@ -2425,10 +2424,7 @@ void Bisection::bisectRing(const std::vector<int>& around) {
   for (std::size_t i = 0; i < around.size(); ++i) {
     const int t = around[i], t1 = first + static_cast<int>(i),
               beyond = halves[2 * i + 1].neighbour[3];
-    if (beyond >= 0) {
-      keepForUndo(beyond);
-      *std::find(neighbour[beyond].begin(), neighbour[beyond].end(), t) = t1;
-    }
+    if (beyond >= 0) *std::find(neighbour[beyond].begin(), neighbour[beyond].end(), t) = t1;
     tetOf[M.tets[t][1]] = t1;
     M.type[t] = static_cast<unsigned char>((M.type[t] + 1) % 3);
     ++M.level[t];
@@ -2445,32 +2441,6 @@ void Bisection::bisectRing(const std::vector<int>& around) {
     neighbour[t] = halves[2 * i].neighbour;
     M.faceLabel[t] = halves[2 * i].label;
   }
-}
-
-void Bisection::keepForUndo(int E) {
-  if (E >= undoTets) return;  // new in the trial, or there is none
-  before.push_back({E, M.tets[E], neighbour[E], M.faceLabel[E], M.type[E], M.level[E]});
-}
-
-Bisection::Trial::Trial(Bisection& bisection) : B(bisection) {
-  B.undoNodes = B.M.x.size(), B.undoTets = static_cast<int>(B.M.tets.size());
-}
-
-Bisection::Trial::~Trial() { B.undo(); }
-
-void Bisection::undo() {
-  M.x.resize(undoNodes), M.xi.resize(undoNodes), M.parameter.resize(undoNodes);
-  M.dimension.resize(undoNodes), M.entity.resize(undoNodes), tetOf.resize(undoNodes);
-  for (auto b = before.rbegin(); b != before.rend(); ++b) {
-    M.tets[b->E] = b->tet, neighbour[b->E] = b->neighbour, M.faceLabel[b->E] = b->label;
-    M.type[b->E] = b->type, M.level[b->E] = b->level;
-    for (int n : b->tet)
-      if (n < static_cast<int>(undoNodes)) tetOf[n] = b->E;
-  }
-  M.tets.resize(undoTets), neighbour.resize(undoTets), M.faceLabel.resize(undoTets);
-  M.type.resize(undoTets), M.level.resize(undoTets);
-  before.clear(), splits.clear();
-  undoTets = -1;
 }
 
 void Bisection::bisect(int E, int depth) {
@@ -4890,25 +4860,80 @@ namespace {
 struct Cubes {
   KeyMap number;                    // cube → 1 + its place in the others
   std::vector<std::uint64_t> keys;  // in the lattice
-  std::vector<Vec3> centres;        // physical, of the elements' mean
+  std::vector<Vec3> sums;           // of points
+  std::vector<int> points;          // how many
+
   Cubes(const Mesh& M, const Approximation& A) {
     const Lattice lattice(A.level);
     const std::vector<int> ofT = elementsOf(A.T);
     number = KeyMap(ofT.size() / tetsPerCube);
-    std::vector<int> elements;  // of each cube
     for (int E : ofT) {
-      const std::uint64_t key = lattice.cubeOf(M, E);
-      int& n = number[key];
-      if (n == 0) {
-        keys.push_back(key), centres.push_back({0, 0, 0}), elements.push_back(0);
-        n = static_cast<int>(keys.size());
-      }
-      for (int v : M.tets[E]) centres[n - 1] = centres[n - 1] + .25 * M.x[v];
-      ++elements[n - 1];
+      const std::array<int, 4>& z = M.tets[E];
+      add(lattice.cubeOf(M, E), .25 * (M.x[z[0]] + M.x[z[1]] + M.x[z[2]] + M.x[z[3]]));
     }
-    for (std::size_t c = 0; c < keys.size(); ++c) centres[c] = (1. / elements[c]) * centres[c];
   }
+  void add(std::uint64_t cube, Vec3 point) {
+    int& n = number[cube];
+    if (n == 0) {
+      keys.push_back(cube), sums.push_back({0, 0, 0}), points.push_back(0);
+      n = static_cast<int>(keys.size());
+    }
+    sums[n - 1] += point, ++points[n - 1];
+  }
+  /// Physical: the mean of the elements', or of where they expect it.
+  Vec3 centre(std::size_t c) const { return (1. / points[c]) * sums[c]; }
 };
+
+/// A lattice node of the cube, corner 0 to 7; of a node, a cube around it.
+std::uint64_t cornerOf(std::uint64_t cube, int corner) {
+  const std::array<std::int64_t, 3> p = Lattice::position(cube);
+  return Lattice::key(
+      {p[0] + (corner & 1 ? 1 : -1), p[1] + (corner & 2 ? 1 : -1), p[2] + (corner & 4 ? 1 : -1)});
+}
+
+/// The lattice nodes of 𝓣: place → 1 + mesh node.
+KeyMap nodesOf(const Mesh& M, const Approximation& A) {
+  const Lattice lattice(A.level);
+  const std::vector<int> elements = elementsOf(A.T);
+  KeyMap meshNode(elements.size() / 3);
+  for (int E : elements)
+    for (int n : M.tets[E])
+      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
+  return meshNode;
+}
+
+/// At its node i an element spans a cone: where that has the centre of a cube, the element's affine
+/// map tells its place.
+void addCubesInCone(const Mesh& M, std::array<int, 4> z, int i, const Lattice& lattice,
+                    Cubes& cubes) {
+  std::swap(z[0], z[i]);
+  const Vec3 at = M.xi[z[0]], x = M.x[z[0]];
+  const Mat3 edges{M.xi[z[1]] - at, M.xi[z[2]] - at, M.xi[z[3]] - at};
+  const Mat3 images{M.x[z[1]] - x, M.x[z[2]] - x, M.x[z[3]] - x};
+  const Mat3 toEdges = inverse(edges);
+  const double half = .5 / lattice.scale;
+  for (int corner = 0; corner < 8; ++corner) {
+    const Vec3 toCentre{corner & 1 ? half : -half, corner & 2 ? half : -half,
+                        corner & 4 ? half : -half};
+    const Vec3 w = toEdges * toCentre;
+    if (std::min({w.x, w.y, w.z}) >= 0)
+      cubes.add(cornerOf(lattice.node(at), corner), x + images * w);
+  }
+}
+
+/// The cubes of 𝓣 and those that touch it, where the mesh may be coarser.
+Cubes cubesAround(const Mesh& M, const Approximation& A) {
+  const Lattice lattice(A.level);
+  Cubes cubes(M, A);
+  std::vector<char> touches(M.x.size(), 0);  // the nodes around which all cubes are taken
+  for (int E : elementsOf(A.T))
+    for (int n : M.tets[E])
+      if (lattice.isNode(M.xi[n])) touches[n] = !isOnBoundary(M, n);
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
+    for (int i = 0; i < 4 && !A.T[E]; ++i)
+      if (touches[M.tets[E][i]]) addCubesInCone(M, M.tets[E], i, lattice, cubes);
+  return cubes;
+}
 
 /// A weighted graph on cubes, for minimumCut(). Directions: −x, +x, −y, +y, −z, +z.
 struct CubeGraph {
@@ -4976,17 +5001,17 @@ std::vector<char> minimumCut(CubeGraph G) {
 /// each square 1, and each cube on the wrong side of S perDistance times its distance from S, in h.
 /// What lies beyond the layer is on its own side, and so are the cubes that touch an earlier
 /// surface or the boundary: S_M must not pass there.
-CubeGraph graphOf(const Mesh& M, const Approximation& layer, const Cubes& cubes,
-                  const SurfaceDistance& S, double perDistance, const Crew& crew) {
+CubeGraph graphOf(const Mesh& M, const Cubes& cubes, int level, const SurfaceDistance& S,
+                  double perDistance, const Crew& crew) {
   constexpr CubeGraph::Weight perSquare = 1000, firm = 1000000 * perSquare;
-  const Lattice lattice(layer.level);
-  const double perH = 1 / cubeEdge(M, layer.level);
+  const Lattice lattice(level);
+  const double perH = 1 / cubeEdge(M, level);
   CubeGraph G;
   const int count = static_cast<int>(cubes.keys.size());
   G.above.resize(count), G.next.resize(count), G.weight.resize(count);
   crew.forPieces(0, count, queryPiece, [&](int, int from, int to) {
     for (int c = from; c < to; ++c) {
-      const SurfaceQuery at = S.query(cubes.centres[c]);
+      const SurfaceQuery at = S.query(cubes.centre(c));
       G.above[c] = std::llround(perDistance * perSquare * perH * at.side);
       for (int d = 0; d < 6; ++d) {
         std::array<std::int64_t, 3> beyond = Lattice::position(cubes.keys[c]);
@@ -4997,30 +5022,11 @@ CubeGraph graphOf(const Mesh& M, const Approximation& layer, const Cubes& cubes,
       }
     }
   });
-  for (int E : elementsOf(layer.T))
-    for (int n : M.tets[E])
-      if (M.dimension[n] < 3 && lattice.isNode(M.xi[n]))
-        G.above[cubes.number.get(lattice.cubeOf(M, E)) - 1] =
-            S.query(M.x[n]).side >= 0 ? firm : -firm;
+  for (std::size_t n = 0; n < M.x.size(); ++n)
+    for (int corner = 0; corner < 8 && M.dimension[n] < 3 && lattice.isNode(M.xi[n]); ++corner)
+      if (const int c = cubes.number.get(cornerOf(lattice.node(M.xi[n]), corner)))
+        G.above[c - 1] = S.query(M.x[n]).side >= 0 ? firm : -firm;
   return G;
-}
-
-/// A lattice node of the cube: corner 0 to 7.
-std::uint64_t cornerOf(std::uint64_t cube, int corner) {
-  const std::array<std::int64_t, 3> p = Lattice::position(cube);
-  return Lattice::key(
-      {p[0] + (corner & 1 ? 1 : -1), p[1] + (corner & 2 ? 1 : -1), p[2] + (corner & 4 ? 1 : -1)});
-}
-
-/// The lattice nodes of 𝓣: place → 1 + mesh node.
-KeyMap nodesOf(const Mesh& M, const Approximation& A) {
-  const Lattice lattice(A.level);
-  const std::vector<int> elements = elementsOf(A.T);
-  KeyMap meshNode(elements.size() / 3);
-  for (int E : elements)
-    for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
-  return meshNode;
 }
 
 /// Whether the element has this point of the computational space; exact, all numbers are dyadic.
@@ -5052,20 +5058,10 @@ void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
 struct DividedCubes {
   std::vector<std::uint64_t> above, below, touching;  // sorted; of those below the touching ones
 };                                                    // touch one above
-DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDistance& S,
+DividedCubes divideCubes(const Mesh& M, const Approximation& A, const SurfaceDistance& S,
                          double perDistance, const Crew& crew) {
-  const Lattice lattice(A.level);
-  std::vector<char> seen(B.M.x.size(), 0);
-  std::vector<int> nodes;
-  for (int E : elementsOf(A.T))
-    for (int n : B.M.tets[E])
-      if (lattice.isNode(B.M.xi[n]) && !seen[n] && !isOnBoundary(B.M, n))
-        seen[n] = 1, nodes.push_back(n);
-  const Bisection::Trial trial(B);
-  Approximation layer = A;
-  for (int n : nodes) addElementsAt(B, layer, n);
-  const Cubes cubes(B.M, layer);
-  const std::vector<char> isAbove = minimumCut(graphOf(B.M, layer, cubes, S, perDistance, crew));
+  const Cubes cubes = cubesAround(M, A);
+  const std::vector<char> isAbove = minimumCut(graphOf(M, cubes, A.level, S, perDistance, crew));
   DividedCubes divided;
   KeyMap cornersAbove(isAbove.size());
   for (std::size_t c = 0; c < isAbove.size(); ++c) {
@@ -5083,11 +5079,29 @@ DividedCubes divideCubes(Bisection& B, const Approximation& A, const SurfaceDist
   return divided;
 }
 
+/// [choice] Elements at faces of earlier surfaces that touch 𝓣 are refined to its level: coarse
+/// faces are off their surface, which S may be nearer to.
+void refineSurfacesAround(Bisection& B, Approximation& A) {
+  std::vector<char> isOfT(B.M.x.size(), 0);
+  for (int E : elementsOf(A.T))
+    for (int n : B.M.tets[E]) isOfT[n] = 1;
+  const auto isCoarse = [&](int E) {
+    const std::array<int, 4>&z = B.M.tets[E], &label = B.M.faceLabel[E];
+    isOfT.resize(B.M.x.size(), 0);
+    return B.M.level[E]<A.level&& * std::max_element(label.begin(), label.end())> 0 &&
+           (isOfT[z[0]] || isOfT[z[1]] || isOfT[z[2]] || isOfT[z[3]]);
+  };
+  for (int E = 0; E < static_cast<int>(B.M.tets.size()); ++E)
+    while (isCoarse(E)) B.bisect(E);
+  A.T.resize(B.M.tets.size(), 0);
+}
+
 }  // namespace
 
-Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S,
+Approximation middleApproximation(Bisection& B, Approximation A, const SurfaceDistance& S,
                                   double perDistance, const Crew& crew) {
-  const DividedCubes cubes = divideCubes(B, A, S, perDistance, crew);
+  refineSurfacesAround(B, A);
+  const DividedCubes cubes = divideCubes(B.M, A, S, perDistance, crew);
   const KeyMap meshNode = nodesOf(B.M, A);
   for (std::uint64_t cube : cubes.touching) {
     int node = 0;
@@ -5147,7 +5161,7 @@ void addSquares(const Mesh& M, const Approximation& A, const KeyMap& meshNode, S
           s.node[e] = meshNode.get(Lattice::key(corner)) - 1;
         }
         s.centre = .25 * (M.x[s.node[0]] + M.x[s.node[1]] + M.x[s.node[2]] + M.x[s.node[3]]);
-        s.beyond = 2 * s.centre - cubes.centres[c];
+        s.beyond = 2 * s.centre - cubes.centre(c);
         s.facesAbove = std::binary_search(A.above.begin(), A.above.end(), Lattice::key(beyond));
         s.facesBelow = std::binary_search(A.below.begin(), A.below.end(), Lattice::key(beyond));
         Q.squares.push_back(s);

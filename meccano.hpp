@@ -436,15 +436,6 @@ struct Bisection {
   void star(int n, std::vector<int>& around) const;
   int coarserAt(int n, int level, std::vector<int>& around) const;
   int tetWithEdge(int a, int b) const;
-  /// Takes the bisections back at its end: the mesh and its adjacency are as they were, the log is
-  /// empty. One at a time.
-  struct Trial {
-    Bisection& B;
-    explicit Trial(Bisection& B);
-    Trial(const Trial&) = delete;
-    Trial& operator=(const Trial&) = delete;
-    ~Trial();
-  };
 
   /// Dimension and number (as in Mesh::entity) of what the edge (a, b) lies on.
   struct EdgeEntity {
@@ -453,15 +444,6 @@ struct Bisection {
   EdgeEntity entityOf(int a, int b, const std::vector<int>& around) const;
 
  private:
-  struct Before {
-    int E;
-    std::array<int, 4> tet, neighbour, label;
-    unsigned char type, level;
-  };
-  std::vector<Before> before;  // what has changed in a trial, oldest first
-  std::size_t undoNodes = 0;
-  int undoTets = -1;  // -1: no trial
-
   mutable std::vector<int> walkedBy;  // [tets] the last walk that came by
   mutable int walk = 0;
 
@@ -469,8 +451,6 @@ struct Bisection {
   template <class Wanted>
   int walkStar(int n, std::vector<int>& around, const Wanted& wanted) const;
   int addMidpoint(int a, int b, const std::vector<int>& around);
-  void keepForUndo(int E);
-  void undo();
   void bisectRing(const std::vector<int>& around);
 };
 
@@ -831,7 +811,7 @@ SquareSurface boundarySquares(const Mesh& M, const Approximation& A);
 /// makes a step where it pays, and keeps clear of earlier surfaces and the boundary. A large
 /// perDistance lets the centres decide alone. To be healed by volumetricHealing().
 ///   source  the minimum cut of a graph; Dinic 1970
-Approximation middleApproximation(Bisection& B, const Approximation& A, const SurfaceDistance& S,
+Approximation middleApproximation(Bisection& B, Approximation A, const SurfaceDistance& S,
                                   double perDistance, const Crew& crew = Crew());
 
 /// What of each square is selected: bit e is its quarter, the triangle of corner e, corner e + 1

@@ -407,27 +407,6 @@ TEST_SUITE("2") {
     }
   }
 
-  TEST_CASE("bisection: a trial is taken back to the same mesh and adjacency") {
-    Mesh M = locallyRefined(boxMesh({0, 0, 0}, {1, 2, 1}, {1, 2, 1}), 7, 100);
-    Bisection bisection(M);
-    const Mesh before = M;
-    const std::vector<std::array<int, 4>> neighbour = bisection.neighbour;
-    Dice dice(19);
-    for (int round = 0; round < 3; ++round) {
-      {
-        const Bisection::Trial trial(bisection);
-        for (int i = 0; i < 100; ++i) bisection.bisect(dice.below(M.tets.size()));
-        CHECK(M.tets.size() > before.tets.size() + 100);
-      }
-      CHECK(shapes::sameMesh(M, before));
-      CHECK(bisection.neighbour == neighbour);
-      CHECK(bisection.tetOf.size() == M.x.size());
-      for (std::size_t n = 0; n < M.x.size(); ++n) CHECK(has(M.tets[bisection.tetOf[n]], n));
-    }
-    for (int i = 0; i < 50; ++i) bisection.bisect(dice.below(M.tets.size()));
-    CHECK(bisection.neighbour == faceNeighbours(M));
-  }
-
   TEST_CASE("bisection: bisectEdge splits the edge asked for and no other way than by closure") {
     Mesh M = locallyRefined(boxMesh({0, 0, 0}, {1, 1, 1}, {1, 1, 1}), 19, 40);
     Dice dice(20);
