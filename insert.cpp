@@ -335,29 +335,25 @@ namespace {
 template <class Wanted>
 std::vector<std::array<int, 3>> labelledFaces(const Mesh& M, Wanted wanted) {
   constexpr int outward[4][3] = {{1, 2, 3}, {0, 3, 2}, {0, 1, 3}, {0, 2, 1}};
-  std::vector<std::array<int, 3>> faces;
-  std::vector<std::pair<std::array<int, 3>, std::size_t>> inserted;  // sorted nodes, place in faces
+  std::vector<std::array<int, 3>> faces, sorted;  // as seen; by node numbers
+  // chains of the faces of each lowest node, latest first
+  std::vector<int> latest(M.x.size(), -1), earlier;
   for (std::size_t E = 0; E < M.faceLabel.size(); ++E) {
     const std::array<int, 4>&labels = M.faceLabel[E], &z = M.tets[E];
     if ((labels[0] | labels[1] | labels[2] | labels[3]) == 0) continue;  // most are inside
     for (int i = 0; i < 4; ++i) {
-      const int label = labels[i];
-      if (label == 0) continue;
-      std::array<int, 3> face{z[outward[i][0]], z[outward[i][1]], z[outward[i][2]]};
-      if (!wanted(label, face)) continue;
-      faces.push_back(face);
-      std::sort(face.begin(), face.end());
-      if (label > 0) inserted.push_back({face, faces.size() - 1});
+      const std::array<int, 3> face{z[outward[i][0]], z[outward[i][1]], z[outward[i][2]]};
+      if (labels[i] == 0 || !wanted(labels[i], face)) continue;
+      std::array<int, 3> key = face;
+      std::sort(key.begin(), key.end());
+      int same = labels[i] > 0 ? latest[key[0]] : -1;
+      while (same >= 0 && sorted[same] != key) same = earlier[same];
+      if (same >= 0) continue;
+      earlier.push_back(latest[key[0]]);
+      latest[key[0]] = static_cast<int>(faces.size());
+      sorted.push_back(key), faces.push_back(face);
     }
   }
-  std::sort(inserted.begin(), inserted.end());
-  std::vector<char> isSecond(faces.size(), 0);
-  for (std::size_t i = 1; i < inserted.size(); ++i)
-    isSecond[inserted[i].second] = inserted[i].first == inserted[i - 1].first;
-  std::size_t kept = 0;
-  for (std::size_t i = 0; i < faces.size(); ++i)
-    if (!isSecond[i]) faces[kept++] = faces[i];
-  faces.resize(kept);
   return faces;
 }
 
