@@ -5050,7 +5050,7 @@ void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
   }
 }
 
-/// The cubes of 𝓣 and all around it, as S_M divides them; their elements are not in the mesh.
+/// The cubes of 𝓣 and all around it, as S_M divides them; their elements may be coarser.
 struct DividedCubes {
   std::vector<std::uint64_t> above, below, touching;  // sorted; of those below the touching ones
 };                                                    // touch one above
