@@ -5083,8 +5083,9 @@ void refineSurfacesAround(Bisection& B, Approximation& A) {
     for (int n : B.M.tets[E]) isOfT[n] = 1;
   const auto isCoarse = [&](int E) {
     const std::array<int, 4>&z = B.M.tets[E], &label = B.M.faceLabel[E];
+    const bool isAtSurface = *std::max_element(label.begin(), label.end()) > 0;
     isOfT.resize(B.M.x.size(), 0);
-    return B.M.level[E]<A.level&& * std::max_element(label.begin(), label.end())> 0 &&
+    return isAtSurface && B.M.level[E] < A.level &&
            (isOfT[z[0]] || isOfT[z[1]] || isOfT[z[2]] || isOfT[z[3]]);
   };
   for (int E = 0; E < static_cast<int>(B.M.tets.size()); ++E)
