@@ -5854,142 +5854,151 @@ void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
     }
 }
 
-namespace {
-
-/// S_M as a complex: its nodes, edges and rim, read off the labelled faces of some elements.
-struct SurfaceComplex {
-  std::vector<char> node;  // [mesh nodes], 0 off S_M, 1 inside, 2 on the rim
-  KeyMap edges;            // edge → faces there: 1 rim, 2 inside
-  std::vector<std::pair<int, int>> edgeList;
-  SurfaceComplex(const Bisection& B, int k, const std::vector<int>& elements)
-      : node(B.M.x.size(), 0), edges(elements.size() / 8) {
-    for (int E : elements)
-      for (int i = 0; i < 4; ++i) {
-        if (B.M.faceLabel[E][i] != k || B.neighbour[E][i] < E) continue;  // once a face
-        const std::array<int, 3> v = faceOpposite(B.M.tets[E], i);
-        for (int e = 0; e < 3; ++e) {
-          node[v[e]] = 1;
-          if (edges[edgeKey(v[e], v[(e + 1) % 3])]++ == 0)
-            edgeList.push_back({v[e], v[(e + 1) % 3]});
-        }
-      }
-    for (const auto& [a, b] : edgeList)
-      if (isRimEdge(a, b)) node[a] = node[b] = 2;
-  }
-  /// The vertices of a tetrahedron on S_M.
-  int count(const std::array<int, 4>& z) const {
-    return (node[z[0]] > 0) + (node[z[1]] > 0) + (node[z[2]] > 0) + (node[z[3]] > 0);
-  }
-  bool isEdge(int a, int b) const { return node[a] && node[b] && edges.get(edgeKey(a, b)) > 0; }
-  bool isRimEdge(int a, int b) const { return edges.get(edgeKey(a, b)) == 1; }
-};
-
-constexpr int tetEdges[6][2] = {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}};
-
-/// Bisects the edges; true where there were any.
-bool bisectEdges(Bisection& B, const std::vector<std::pair<int, int>>& edges) {
-  for (const auto& [a, b] : edges) B.bisectEdge(a, b);
-  return !edges.empty();
-}
-
-}  // namespace
-
-std::vector<int> elementsAt(const Mesh& M, int k) {
+SurfaceComplex::SurfaceComplex(const Bisection& B, int k)
+    : surface(k), isNear_(B.M.tets.size(), 0) {
+  const Mesh& M = B.M;
   std::vector<char> on(M.x.size(), 0);
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int i = 0; i < 4; ++i)
       if (M.faceLabel[E][i] == k)
         for (int n : faceOpposite(M.tets[E], i)) on[n] = 1;
-  std::vector<int> elements;
   for (std::size_t E = 0; E < M.tets.size(); ++E) {
     const std::array<int, 4>& z = M.tets[E];
-    if (on[z[0]] || on[z[1]] || on[z[2]] || on[z[3]]) elements.push_back(static_cast<int>(E));
+    if (!on[z[0]] && !on[z[1]] && !on[z[2]] && !on[z[3]]) continue;
+    isNear_[E] = 1, elements.push_back(static_cast<int>(E));
   }
-  return elements;
+  readEdges(B);
 }
 
-bool refineTetrahedraWithTwoFaces(Bisection& B, int k, const std::vector<int>& near) {
+void SurfaceComplex::update(const Bisection& B, std::size_t firstSplit) {
+  if (firstSplit == B.splits.size()) return;
+  isNear_.resize(B.M.tets.size(), 0);
+  // a new node of S_M lies on an edge of it: the elements there are parts of near ones
+  for (std::size_t i = firstSplit; i < B.splits.size(); ++i)
+    if (isNear_[B.splits[i].parent])
+      isNear_[B.splits[i].child] = 1, elements.push_back(B.splits[i].child);
+  readEdges(B);
+}
+
+void SurfaceComplex::readEdges(const Bisection& B) {
+  node.assign(B.M.x.size(), 0), firstEdge_.assign(B.M.x.size(), -1);
+  edges.clear();
+  for (int E : elements)
+    for (int i = 0; i < 4; ++i) {
+      if (B.M.faceLabel[E][i] != surface || B.neighbour[E][i] < E) continue;  // once a face
+      const std::array<int, 3> v = faceOpposite(B.M.tets[E], i);
+      for (int e = 0; e < 3; ++e) {
+        const auto [a, b] = std::minmax(v[e], v[(e + 1) % 3]);
+        int at = edgeBetween(a, b);
+        if (at < 0) {
+          at = static_cast<int>(edges.size());
+          edges.push_back({a, b, 0, firstEdge_[a]});
+          firstEdge_[a] = at;
+        }
+        ++edges[at].faces;
+        node[v[e]] = 1;
+      }
+    }
+  for (const Edge& e : edges)
+    if (e.faces == 1) node[e.a] = node[e.b] = 2;
+}
+
+int SurfaceComplex::edgeBetween(int a, int b) const {
+  int at = firstEdge_[std::min(a, b)];
+  while (at >= 0 && edges[at].b != std::max(a, b)) at = edges[at].next;
+  return at;
+}
+
+namespace {
+
+/// The vertices of a tetrahedron on S_M.
+int nodesOn(const SurfaceComplex& SM, const std::array<int, 4>& z) {
+  return (SM.node[z[0]] > 0) + (SM.node[z[1]] > 0) + (SM.node[z[2]] > 0) + (SM.node[z[3]] > 0);
+}
+
+constexpr int tetEdges[6][2] = {{0, 1}, {0, 2}, {0, 3}, {1, 2}, {1, 3}, {2, 3}};
+
+/// Bisects the edges; true where there were any.
+bool bisectEdges(Bisection& B, SurfaceComplex& SM, const std::vector<std::pair<int, int>>& edges) {
+  const std::size_t splits = B.splits.size();
+  for (const auto& [a, b] : edges) B.bisectEdge(a, b);
+  SM.update(B, splits);
+  return !edges.empty();
+}
+
+}  // namespace
+
+bool refineTetrahedraWithTwoFaces(Bisection& B, SurfaceComplex& SM) {
   std::vector<std::pair<int, int>> refine;  // tetrahedron, level
-  for (int E : near) {
+  for (int E : SM.elements) {
     const std::array<int, 4>& label = B.M.faceLabel[E];
-    if (std::count(label.begin(), label.end(), k) > 1) refine.push_back({E, B.M.level[E]});
+    if (std::count(label.begin(), label.end(), SM.surface) > 1) refine.push_back({E, B.M.level[E]});
   }
+  const std::size_t splits = B.splits.size();
   for (const auto& [E, level] : refine)
     if (B.M.level[E] == level) B.bisect(E);
+  SM.update(B, splits);
   return !refine.empty();
 }
 
-bool refineFacesWithTwoRimEdges(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B, k, near);
+bool refineFacesWithTwoRimEdges(Bisection& B, SurfaceComplex& SM) {
   std::vector<std::pair<int, int>> refine;
-  for (int E : near)
-    for (int i = 0; i < 4 && SM.count(B.M.tets[E]) > 2; ++i) {
+  for (int E : SM.elements)
+    for (int i = 0; i < 4 && nodesOn(SM, B.M.tets[E]) > 2; ++i) {
       const std::array<int, 3> v = faceOpposite(B.M.tets[E], i);
       if (SM.node[v[0]] != 2 || SM.node[v[1]] != 2 || SM.node[v[2]] != 2) continue;
       int rimEdges = 0;
       for (int e = 0; e < 3; ++e) rimEdges += SM.isRimEdge(v[e], v[(e + 1) % 3]);
       if (rimEdges > 1) refine.push_back(refinementEdge(B.M, v));
     }
-  return bisectEdges(B, refine);
+  return bisectEdges(B, SM, refine);
 }
 
-bool refineEdgesAcrossTheRim(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B, k, near);
+bool refineEdgesAcrossTheRim(Bisection& B, SurfaceComplex& SM) {
   std::vector<std::pair<int, int>> refine;
-  for (const auto& [a, b] : SM.edgeList)
-    if (SM.node[a] == 2 && SM.node[b] == 2 && !SM.isRimEdge(a, b)) refine.push_back({a, b});
-  return bisectEdges(B, refine);
+  for (const SurfaceComplex::Edge& e : SM.edges)
+    if (e.faces > 1 && SM.node[e.a] == 2 && SM.node[e.b] == 2) refine.push_back({e.a, e.b});
+  return bisectEdges(B, SM, refine);
 }
 
-bool refineEdgesBetweenSurfaces(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B, k, near);
+bool refineEdgesBetweenSurfaces(Bisection& B, SurfaceComplex& SM) {
   std::vector<std::pair<int, int>> refine;
-  for (int E : near)
+  for (int E : SM.elements)
     for (const auto& e : tetEdges) {
       const int a = B.M.tets[E][e[0]], b = B.M.tets[E][e[1]];
       if ((SM.node[a] && B.M.dimension[b] < 3 && !SM.node[b]) ||
           (SM.node[b] && B.M.dimension[a] < 3 && !SM.node[a]))
         refine.push_back({a, b});
     }
-  return bisectEdges(B, refine);
+  return bisectEdges(B, SM, refine);
 }
 
-bool refineToFullSubcomplex(Bisection& B, int k, const std::vector<int>& near) {
-  const SurfaceComplex SM(B, k, near);
+bool refineToFullSubcomplex(Bisection& B, SurfaceComplex& SM) {
   std::vector<std::pair<int, int>> refine;
-  for (int E : near) {
+  for (int E : SM.elements) {
     const std::array<int, 4>& z = B.M.tets[E];
-    if (SM.count(z) < 2) continue;
+    if (nodesOn(SM, z) < 2) continue;
     for (const auto& e : tetEdges)
       if (SM.node[z[e[0]]] && SM.node[z[e[1]]] && !SM.isEdge(z[e[0]], z[e[1]]))
         refine.push_back({z[e[0]], z[e[1]]});
     for (int i = 0; i < 4; ++i) {
       const std::array<int, 3> v = faceOpposite(z, i);
-      if (B.M.faceLabel[E][i] != k && SM.isEdge(v[0], v[1]) && SM.isEdge(v[1], v[2]) &&
+      if (B.M.faceLabel[E][i] != SM.surface && SM.isEdge(v[0], v[1]) && SM.isEdge(v[1], v[2]) &&
           SM.isEdge(v[2], v[0]))
         refine.push_back(refinementEdge(B.M, v));
     }
   }
-  return bisectEdges(B, refine);
+  return bisectEdges(B, SM, refine);
 }
 
 int surfaceHealing(Bisection& B, int k) {
   constexpr int maxRounds = 30;  // [choice] rounds end after 2 to 5 where they end
-  std::vector<int> near = elementsAt(B.M, k);
-  std::vector<char> isNear(B.M.tets.size(), 0);
-  for (int E : near) isNear[E] = 1;
+  SurfaceComplex SM(B, k);
   for (int round = 1; round <= maxRounds; ++round) {
     bool changed = false;
-    for (auto rule :
-         {refineTetrahedraWithTwoFaces, refineFacesWithTwoRimEdges, refineEdgesAcrossTheRim,
-          refineEdgesBetweenSurfaces, refineToFullSubcomplex}) {
-      B.splits.clear();
-      changed |= rule(B, k, near);
-      // a new node of S_M lies on an edge of it: the elements there are parts of near ones
-      isNear.resize(B.M.tets.size(), 0);
-      for (const Bisection::Split& split : B.splits)
-        if (isNear[split.parent]) isNear[split.child] = 1, near.push_back(split.child);
-    }
+    for (auto rule : {refineTetrahedraWithTwoFaces, refineFacesWithTwoRimEdges,
+                      refineEdgesAcrossTheRim, refineEdgesBetweenSurfaces, refineToFullSubcomplex})
+      changed |= rule(B, SM);
     if (!changed) return round;
   }
   throw MethodError("insertSurface (§3.5): the rules of surface healing do not settle after " +

@@ -843,21 +843,43 @@ bool removeThinProtrusions(const SquareSurface& Q, Selection& selected);
 /// [§3.5.2] Adds the square in the plane of the two rim edges at rim nodes with five or more
 /// triangles.
 bool fillHighConnectivityNodes(const Mesh& M, const SquareSurface& Q, Selection& selected);
-/// The elements with a node of S_M, surface k: `near`, of the rules that follow, has at least
-/// these.
-std::vector<int> elementsAt(const Mesh& M, int k);
+/// S_M, surface k, as a complex, with the elements at it: what the rules that follow look at.
+class SurfaceComplex {
+ public:
+  struct Edge {
+    int a, b;   // nodes, a < b
+    int faces;  // of S_M at it: 1 on the rim, 2 inside
+    int next;   // edge at a, -1: none
+  };
+  SurfaceComplex(const Bisection& B, int k);
+  /// Follows the mesh after the bisections of B.splits[firstSplit], ...
+  void update(const Bisection& B, std::size_t firstSplit);
+  bool isEdge(int a, int b) const { return node[a] && node[b] && edgeBetween(a, b) >= 0; }
+  bool isRimEdge(int a, int b) const { return isEdge(a, b) && edges[edgeBetween(a, b)].faces == 1; }
+
+  const int surface;          // its number k
+  std::vector<int> elements;  // with a node on S_M, at least
+  std::vector<char> node;     // [nodes] 0 off S_M, 1 inside, 2 on the rim
+  std::vector<Edge> edges;
+
+ private:
+  void readEdges(const Bisection& B);
+  int edgeBetween(int a, int b) const;  // -1: none
+  std::vector<char> isNear_;            // [tets] is one of `elements`
+  std::vector<int> firstEdge_;          // [nodes] of which it is the lower one, -1: none
+};
 /// [§3.5.3] Refines tetrahedra with more than one face on S_M.
-bool refineTetrahedraWithTwoFaces(Bisection& B, int k, const std::vector<int>& near);
+bool refineTetrahedraWithTwoFaces(Bisection& B, SurfaceComplex& SM);
 /// [§3.5.4] Refines faces with more than one edge on the rim of S_M.
-bool refineFacesWithTwoRimEdges(Bisection& B, int k, const std::vector<int>& near);
+bool refineFacesWithTwoRimEdges(Bisection& B, SurfaceComplex& SM);
 /// [§3.5.5] Refines inner edges of S_M with both ends on its rim.
-bool refineEdgesAcrossTheRim(Bisection& B, int k, const std::vector<int>& near);
+bool refineEdgesAcrossTheRim(Bisection& B, SurfaceComplex& SM);
 /// [§3.5.6] Refines edges that join S_M to another surface or to the boundary.
-bool refineEdgesBetweenSurfaces(Bisection& B, int k, const std::vector<int>& near);
+bool refineEdgesBetweenSurfaces(Bisection& B, SurfaceComplex& SM);
 /// [§3.5] [departure] S_M must be a full subcomplex: bisects each edge with both ends on S_M that
 /// is no edge of it, and splits each face with three nodes on S_M that is no face of it. Where S is
 /// flat such a chord has zero length to give: the six cases alone left no random surface valid.
-bool refineToFullSubcomplex(Bisection& B, int k, const std::vector<int>& near);
+bool refineToFullSubcomplex(Bisection& B, SurfaceComplex& SM);
 /// [§3.5] Cases 3 to 6 and the full subcomplex until nothing changes.
 ///   returns rounds;  errors  MethodError after 30
 int surfaceHealing(Bisection& B, int k);

@@ -112,7 +112,26 @@ Mesh threeSquares(bool missingAbove) {
   return M;
 }
 
-using Rule = bool (*)(Bisection&, int, const std::vector<int>&);
+using Rule = bool (*)(Bisection&, SurfaceComplex&);
+
+/// Applies a rule to surface k as the mesh has it.
+bool apply(Rule rule, Bisection& B, int k) {
+  SurfaceComplex SM(B, k);
+  return rule(B, SM);
+}
+
+/// What a complex says of its surface, in no order of its own.
+std::set<std::array<int, 4>> described(const SurfaceComplex& SM) {
+  std::set<std::array<int, 4>> all;
+  for (const SurfaceComplex::Edge& e : SM.edges) {
+    CHECK(SM.isEdge(e.b, e.a));
+    CHECK(SM.isRimEdge(e.a, e.b) == (e.faces == 1));
+    all.insert({e.a, e.b, e.faces, 0});
+  }
+  for (int n = 0; n < static_cast<int>(SM.node.size()); ++n)
+    if (SM.node[n]) all.insert({n, n, SM.node[n], 1});
+  return all;
+}
 
 /// Applies a case to M; it must change something, keep the mesh sound and S_M's area and topology,
 /// and do nothing the second time.
@@ -120,13 +139,16 @@ void applyCase(Mesh& M, Rule rule) {
   const double area = shapes::computationalArea(M, 1), volume = shapes::totalVolume(M);
   const bool disk = shapes::isDisk(surfaceFaces(M, 1));
   Bisection B(M);
-  CHECK(rule(B, 1, elementsAt(M, 1)));
+  SurfaceComplex SM(B, 1);
+  CHECK(rule(B, SM));
+  CHECK(described(SM) == described(SurfaceComplex(B, 1)));
   CHECK(shapes::conformityFault(M) == "");
   CHECK(shapes::totalVolume(M) == doctest::Approx(volume).epsilon(1e-13));
   CHECK(shapes::computationalArea(M, 1) == doctest::Approx(area).epsilon(1e-13));
   CHECK(shapes::isDisk(surfaceFaces(M, 1)) == disk);
   const Mesh once = M;
-  CHECK_FALSE(rule(B, 1, elementsAt(M, 1)));
+  CHECK_FALSE(rule(B, SM));
+  CHECK_FALSE(apply(rule, B, 1));
   CHECK(shapes::sameMesh(M, once));
 }
 
@@ -293,8 +315,8 @@ TEST_SUITE("3.5") {
     Mesh M = cubes(3);
     label(M, {1, 1, 1}, {2, 2, 1});
     Bisection B(M);
-    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 1, elementsAt(B.M, 1)));
-    CHECK_FALSE(refineTetrahedraWithTwoFaces(B, 2, elementsAt(B.M, 1)));  // no such surface
+    CHECK_FALSE(apply(refineTetrahedraWithTwoFaces, B, 1));
+    CHECK_FALSE(apply(refineTetrahedraWithTwoFaces, B, 2));  // no such surface
   }
 
   TEST_CASE("case 4: a face of S_M with two edges on the rim") {
@@ -327,7 +349,7 @@ TEST_SUITE("3.5") {
     label(wide, {1, 1, 2}, {4, 4, 2});
     Bisection B(wide);
     CHECK(edgesAcrossTheRim(wide, 1) == 2);  // diagonals that cut a corner off
-    CHECK(refineEdgesAcrossTheRim(B, 1, elementsAt(B.M, 1)));
+    CHECK(apply(refineEdgesAcrossTheRim, B, 1));
     CHECK(edgesAcrossTheRim(wide, 1) == 0);
   }
 
@@ -344,7 +366,7 @@ TEST_SUITE("3.5") {
     label(M, {2, 2, 3}, {4, 4, 3});
     Bisection none(M);
     CHECK(edgesBetweenSurfaces(M, 1) == 0);
-    CHECK_FALSE(refineEdgesBetweenSurfaces(none, 1, elementsAt(M, 1)));
+    CHECK_FALSE(apply(refineEdgesBetweenSurfaces, none, 1));
     // surface 2, one cube above, its nodes as projection leaves them: of dimension 2 on its own
     // plane
     Parametrization plane;
@@ -398,7 +420,7 @@ TEST_SUITE("3.5") {
     CHECK(chords(M, 1) == 1);  // all of its edges are S_M's
     CHECK(isFace());
     Bisection B(M);
-    CHECK(refineToFullSubcomplex(B, 1, elementsAt(B.M, 1)));
+    CHECK(apply(refineToFullSubcomplex, B, 1));
     CHECK_FALSE(isFace());
     CHECK(shapes::conformityFault(M) == "");
   }
@@ -421,7 +443,7 @@ TEST_SUITE("3.5") {
     label(M, {1, 1, 2}, {3, 3, 2});
     Bisection B(M);
     CHECK(chords(M, 1) == 0);
-    CHECK_FALSE(refineToFullSubcomplex(B, 1, elementsAt(B.M, 1)));
+    CHECK_FALSE(apply(refineToFullSubcomplex, B, 1));
   }
 
   TEST_CASE(
@@ -480,9 +502,9 @@ TEST_SUITE("3.5") {
           Mesh M = I.M;
           Bisection B(M);
           const bool found = c.count(M, 1) > 0;
-          CHECK(c.rule(B, 1, elementsAt(M, 1)) == found);
+          CHECK(apply(c.rule, B, 1) == found);
           CHECK(c.count(M, 1) == 0);
-          CHECK_FALSE(c.rule(B, 1, elementsAt(M, 1)));
+          CHECK_FALSE(apply(c.rule, B, 1));
         }
       }
   }
