@@ -4542,20 +4542,17 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, co
     B.splits.clear();
     for (const auto& [E, level] : refine)
       if (B.M.level[E] == level) B.bisect(E);
-    const int before = static_cast<int>(cut.size());
     cut.resize(B.M.tets.size());
-    changed.clear();
     // what is not cut has no parts that are, but where a midpoint was moved onto a surface
     for (const Bisection::Split& split : B.splits) {
       const bool isPart = B.M.dimension[split.midpoint] == 3;
       const Cut whole = cut[split.parent];
       const Cut part = isPart && whole.is == Cut::no ? whole : Cut{Cut::unknown, whole.triangle};
       cut[split.parent] = cut[split.child] = part;
-      if (split.parent < before) changed.push_back(split.parent);
     }
-    std::sort(changed.begin(), changed.end());
-    changed.erase(std::unique(changed.begin(), changed.end()), changed.end());
-    for (int E = before; E < static_cast<int>(cut.size()); ++E) changed.push_back(E);
+    changed.clear();
+    for (std::size_t E = 0; E < cut.size(); ++E)
+      if (cut[E].is == Cut::unknown) changed.push_back(static_cast<int>(E));
   }
 }
 
@@ -4795,6 +4792,17 @@ KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint
   return at;
 }
 
+/// The lattice nodes of 𝓣: place → 1 + mesh node.
+KeyMap nodesOf(const Mesh& M, const Approximation& A) {
+  const Lattice lattice(A.level);
+  const std::vector<int> elements = elementsOf(A.T);
+  KeyMap meshNode(elements.size() / 3);
+  for (int E : elements)
+    for (int n : M.tets[E])
+      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
+  return meshNode;
+}
+
 /// Whether a node lies on ∂M. T may pass an earlier surface: its squares there are no candidates.
 bool isOnBoundary(const Mesh& M, int n) {
   int curve = 0;
@@ -4825,19 +4833,16 @@ void volumetricHealing(Bisection& B, Approximation& A) {
   std::array<bool, 256> isDisk;
   for (unsigned mask = 0; mask < isDisk.size(); ++mask) isDisk[mask] = isLocalDisk(mask);
   completeCubes(B, A, elementsOf(A.T));
-  const Lattice lattice(A.level);
   for (int round = 0; round < maxRounds; ++round) {
     std::vector<std::uint64_t> keys;
     const KeyMap cubes = cubesAtNodes(B.M, A, keys);
-    KeyMap meshNode(keys.size());
-    for (int E : elementsOf(A.T))
-      for (int n : B.M.tets[E])
-        if (lattice.isNode(B.M.xi[n])) meshNode[lattice.node(B.M.xi[n])] = n;
-    std::vector<int> bad;
+    std::vector<std::uint64_t> bad;
     for (std::uint64_t key : keys)
-      if (!isDisk[cubes.get(key)]) bad.push_back(meshNode.get(key));
+      if (!isDisk[cubes.get(key)]) bad.push_back(key);
     if (bad.empty()) return;
-    for (int n : bad) {
+    const KeyMap meshNode = nodesOf(B.M, A);
+    for (std::uint64_t key : bad) {
+      const int n = meshNode.get(key) - 1;
       if (isOnBoundary(B.M, n))
         throw MethodError("insertSurface (§3.3): T reaches the boundary at node " +
                           std::to_string(n) + "; lower l_c");
@@ -4885,17 +4890,6 @@ std::uint64_t cornerOf(std::uint64_t cube, int corner) {
   const std::array<std::int64_t, 3> p = Lattice::position(cube);
   return Lattice::key(
       {p[0] + (corner & 1 ? 1 : -1), p[1] + (corner & 2 ? 1 : -1), p[2] + (corner & 4 ? 1 : -1)});
-}
-
-/// The lattice nodes of 𝓣: place → 1 + mesh node.
-KeyMap nodesOf(const Mesh& M, const Approximation& A) {
-  const Lattice lattice(A.level);
-  const std::vector<int> elements = elementsOf(A.T);
-  KeyMap meshNode(elements.size() / 3);
-  for (int E : elements)
-    for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
-  return meshNode;
 }
 
 /// At its node i an element spans a cone: where that has the centre of a cube, the element's affine
