@@ -5746,6 +5746,16 @@ std::string blockedPlace(const SquareSurface& Q, const SurfaceDistance& S, const
   return "";
 }
 
+/// [choice] Where S_M leaves a part of S out, as a finger whose squares are hidden in T: no
+/// projection covers that. The place; empty: nowhere.
+///   tree  of the selected squares
+std::string leftOut(const TriangleTree& tree, double h, const SurfaceDistance& S) {
+  constexpr double farthest = 4;  // of h, from a point of S to S_M
+  for (const Vec3& p : S.S.points)
+    if (triangleWithin(tree, p, farthest * h) < 0) return placeText(p);
+  return "";
+}
+
 /// Marks for each sharp corner of S the nearest node of this side.
 void markSharpCorners(const Mesh& M, const SquareSurface& Q, const SurfaceDistance& S, int side,
                       Survey& survey) {
@@ -5781,14 +5791,19 @@ Extraction extractSurface(const Mesh& M, const SquareSurface& Q, const SurfaceDi
     rim.run(false);
     if (outline == Outline::halfSquares) rim.run(true);
   }
-  result.fault = diskFault(Q, result.selected);
   const TriangleTree tree = treeOf(M, Q, result.selected);
+  const std::string noDisk = diskFault(Q, result.selected);
   const std::string blocked = blockedPlace(Q, S, survey, side, tree);
-  if (!blocked.empty()) {
-    result.isBlocked = true;
+  const std::string missing = leftOut(tree, Q.h, S);
+  result.isBlocked = !blocked.empty();
+  if (result.isBlocked)
     result.fault = "another surface is nearer to S than its squares, near " + blocked;
-  }
-  if (result.fault.empty()) result.energy = rim.energy() + uncovered(tree, Q.h, S);
+  else if (!noDisk.empty())
+    result.fault = "S_M is no disk, " + noDisk;
+  else if (!missing.empty())
+    result.fault = "S_M leaves out the part of S near " + missing;
+  else
+    result.energy = rim.energy() + uncovered(tree, Q.h, S);
   return result;
 }
 
@@ -5819,6 +5834,7 @@ void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
   const Lattice lattice(Q.level);
   const KeyMap squareAt = squareNumbers(Q);
   std::array<std::int64_t, 3> half;
+  std::vector<int> labelled;
   for (int E : elementsOf(A.T))
     for (int i = 0; i < 4; ++i) {
       const int other = B.neighbour[E][i];
@@ -5829,8 +5845,10 @@ void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
       M.faceLabel[E][i] = k;
       auto& back = B.neighbour[other];
       M.faceLabel[other][std::find(back.begin(), back.end(), E) - back.begin()] = k;
+      labelled.push_back(E), labelled.push_back(other);
     }
   // A half whose cut is not the mesh's diagonal: bisect that diagonal, the cut appears.
+  const std::size_t firstSplit = B.splits.size();
   for (std::size_t i = 0; i < selected.size(); ++i) {
     if (selected[i] == emptySquare || selected[i] == fullSquare) continue;
     const Square& s = Q.squares[i];
@@ -5838,7 +5856,8 @@ void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
     const int cut = selected[i] == 3 || selected[i] == 12 ? 0 : 1;
     if (s.diagonal != cut) B.bisectEdge(s.node[1 - cut], s.node[3 - cut]);
   }
-  for (std::size_t E = 0; E < M.tets.size(); ++E)
+  for (std::size_t i = firstSplit; i < B.splits.size(); ++i) labelled.push_back(B.splits[i].child);
+  for (int E : labelled)
     for (int i = 0; i < 4; ++i) {
       if (M.faceLabel[E][i] != k) continue;
       const std::array<int, 3> face = faceOpposite(M.tets[E], i);
@@ -6991,17 +7010,6 @@ std::string describe(const Way& way) {
          ", " + (way.outline == Outline::halfSquares ? "half squares" : "whole squares");
 }
 
-/// [choice] Where S_M leaves a part of S out, as a finger whose squares are hidden in T: no
-/// projection covers that. Empty: nowhere.
-std::string leftOut(const Insertion& I, const Selection& selected) {
-  constexpr double farthest = 4;  // of h, from a point of S to S_M
-  const TriangleTree tree = treeOf(I.layer.M, I.layer.Q, selected);
-  for (const Vec3& p : I.S.S.points)
-    if (triangleWithin(tree, p, farthest * I.layer.Q.h) < 0)
-      return "S_M leaves out the part of S near " + placeText(p);
-  return "";
-}
-
 /// [choice] Sides whose rim energies differ by no more are as good as mirrored, and end alike (to
 /// .004 in the lowest q): one is enough.
 constexpr double mirrored = .01;
@@ -7064,18 +7072,11 @@ std::vector<Way> extractWays(Insertion& I, Outline outline) {
   for (int side : I.layer.Q.isMiddle ? std::vector<int>{0} : std::vector<int>{1, -1}) {
     Way way{side, outline,
             extractSurface(I.layer.M, I.layer.Q, I.S, I.layer.survey, side, outline)};
-    const std::string missing =
-        way.extraction.fault.empty() ? leftOut(I, way.extraction.selected) : "";
-    if (!missing.empty())
-      I.leave(describe(way), MethodError("insertSurface (§3.4): " + missing));
-    else if (way.extraction.fault.empty())
+    I.isBlocked = I.isBlocked || way.extraction.isBlocked;
+    if (way.extraction.fault.empty())
       ways.push_back(std::move(way));
     else
-      I.leave(describe(way),
-              MethodError("insertSurface (§3.4): " +
-                          std::string(way.extraction.isBlocked ? "" : "S_M is no disk, ") +
-                          way.extraction.fault));
-    I.isBlocked = I.isBlocked || way.extraction.isBlocked;
+      I.leave(describe(way), MethodError("insertSurface (§3.4): " + way.extraction.fault));
   }
   if (ways.size() < 2) return ways;
   const double first = ways[0].extraction.energy, second = ways[1].extraction.energy;

@@ -822,7 +822,7 @@ using Selection = std::vector<unsigned char>;
 struct Extraction {
   Selection selected;
   double energy = 0;       // what sides are ranked by: rim energy and interior coverage
-  std::string fault;       // why it is no disk, or cannot be used; empty: it is one
+  std::string fault;       // why it cannot be used; empty: it is a disk near all of S
   bool isBlocked = false;  // because another surface is in the way
 };
 /// [§3.4] The squares with all nodes on this side (±1) of S (of a middleApproximation(), side 0:
