@@ -4750,12 +4750,12 @@ void completeCubes(Bisection& B, Approximation& A, std::vector<int> queue) {
   std::array<std::int64_t, 3> square;
   for (std::size_t at = 0; at < queue.size(); ++at)
     for (int i = 0; i < 4; ++i) {
-      const int E = queue[at];
+      const int E = queue[at], across = B.neighbour[E][i];
+      if (across < 0 || A.T[across]) continue;
       if (lattice.squareOf(B.M, faceOpposite(B.M.tets[E], i), square)) continue;
       while (B.M.level[B.neighbour[E][i]] < A.level) B.bisect(B.neighbour[E][i]);
       A.T.resize(B.M.tets.size(), 0);
       const int next = B.neighbour[E][i];
-      if (A.T[next]) continue;
       A.T[next] = 1;
       queue.push_back(next);
     }
@@ -7208,19 +7208,26 @@ int labelAndHeal(Insertion& I, const Way& way, Mesh& M) {
   return surfaceHealing(B, I.k);
 }
 
+/// §3.6 on the healed mesh, with Table I's columns before and after it.
+void project(Insertion& I, Mesh& M, InsertReport& report) {
+  const std::vector<double> healed = qualities(M, I.original.x, I.q);
+  const std::vector<Vec3> before = M.x;
+  report.refined = qualityStatistics(healed);
+  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S, I.crew);
+  const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim, I.crew);
+  report.tangentialShift = projection.tangentialShift;
+  report.projected = qualityStatistics(qualities(M, before, healed));
+}
+
 /// §3.4's labels, 3.5, 3.6 and 3.7 on the refined mesh, which becomes M.
 ///   returns  false: put aside, still tangled
 bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertReport& report) {
   const int rounds = labelAndHeal(I, way, M);
   report.way = I.ways;
-  report.refined = qualityStatistics(qualities(M, I.original, I.q));
   I.stage("surfaceHealed", M);
   I.progress("3.5 surface healing: " + std::to_string(rounds) + " rounds, " +
              std::to_string(M.tets.size()) + " tetrahedra (" + describe(way) + ")");
-  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S, I.crew);
-  const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim, I.crew);
-  report.tangentialShift = projection.tangentialShift;
-  report.projected = qualityStatistics(qualities(M, I.original, I.q));
+  project(I, M, report);
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
   optimizeAround(M, I, patient, nodesNear(M, I.k), report);

@@ -1058,9 +1058,10 @@ QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal = Ideal::computat
 QualityStatistics qualityStatistics(const std::vector<double>& q);
 /// q of each tetrahedron. [tets]
 std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational);
-/// The same where M was made of `before`, whose q are given: computed anew for tetrahedra with
-/// other nodes or places only.
-std::vector<double> qualities(const Mesh& M, const Mesh& before, std::vector<double> q);
+/// The same where M was made by bisection and moves of a mesh with the nodes `before`, whose q are
+/// given: computed anew for tetrahedra with new or moved nodes only, as each part of another has.
+std::vector<double> qualities(const Mesh& M, const std::vector<Vec3>& before,
+                              std::vector<double> q);
 
 // ==== 3. Surface insertion ======================================================================
 

@@ -2330,16 +2330,16 @@ std::vector<double> qualities(const Mesh& M, Ideal ideal) {
   return all;
 }
 
-std::vector<double> qualities(const Mesh& M, const Mesh& before, std::vector<double> all) {
+std::vector<double> qualities(const Mesh& M, const std::vector<Vec3>& before,
+                              std::vector<double> all) {
   std::vector<char> isOld(M.x.size(), 0);
-  for (std::size_t n = 0; n < std::min(M.x.size(), before.x.size()); ++n)
-    isOld[n] = M.x[n] == before.x[n];
+  for (std::size_t n = 0; n < std::min(M.x.size(), before.size()); ++n)
+    isOld[n] = M.x[n] == before[n];
   std::vector<int> changed;
   for (std::size_t E = 0; E < M.tets.size(); ++E) {
     const std::array<int, 4>& z = M.tets[E];
-    const bool isSame = E < before.tets.size() && isOld[z[0]] && isOld[z[1]] && isOld[z[2]] &&
-                        isOld[z[3]] && z == before.tets[E];
-    if (!isSame) changed.push_back(static_cast<int>(E));
+    const bool isSame = isOld[z[0]] && isOld[z[1]] && isOld[z[2]] && isOld[z[3]];
+    if (!isSame || E >= all.size()) changed.push_back(static_cast<int>(E));
   }
   all.resize(M.tets.size());
   forQualities(

@@ -120,7 +120,7 @@ TEST_SUITE("Table I") {
     bisect(M, {5, 80});
     M.x[21] += {.05, -.02, .04};
     std::size_t other = 0;  // whose q is anew
-    const std::vector<double> after = qualities(M, before, q);
+    const std::vector<double> after = qualities(M, before.x, q);
     REQUIRE(after.size() == M.tets.size());
     for (std::size_t E = 0; E < q.size(); ++E) other += after[E] != q[E];
     CHECK(M.tets.size() > before.tets.size());
@@ -129,7 +129,7 @@ TEST_SUITE("Table I") {
     CHECK(after == qualities(M));
     CHECK(qualityStatistics(after).mean == qualityStatistics(M).mean);
     // what has the nodes and places of before is not computed
-    CHECK(qualities(M, M, std::vector<double>(M.tets.size(), .25)) ==
+    CHECK(qualities(M, M.x, std::vector<double>(M.tets.size(), .25)) ==
           std::vector<double>(M.tets.size(), .25));
   }
 
