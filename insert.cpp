@@ -6959,7 +6959,6 @@ struct Layer {
   Approximation A = {};
   SquareSurface Q = {};
   Survey survey = {};
-  std::size_t tets = 0;  // of M, also where it is taken
 };
 
 /// The state of an insertion. The caller's mesh stays as it is.
@@ -7057,7 +7056,6 @@ void refineLayer(Insertion& I, bool isAgain) {
     volumetricHealing(B, layer.A);
   }
   layer.neighbour = std::move(B.neighbour);
-  layer.tets = layer.M.tets.size();
 }
 
 /// The same again where the mesh was taken.
@@ -7436,31 +7434,23 @@ void survey(Insertion& I) {
              " squares around S, h = " + number(layer.Q.h));
 }
 
-/// [choice] The lowest q at which no other way is tried: above 50k tetrahedra they cost too much,
-/// and above 200k minutes.
-double goodQuality(std::size_t tets) { return tets < 50000 ? .6 : tets < 200000 ? .45 : .3; }
+constexpr double goodQuality = .6;  // [choice] the lowest q at which no other way is tried
 
 /// Whether no other way is to be tried.
 bool isGood(const Insertion& I, const InsertReport& report) {
-  const double good = std::min(goodQuality(I.layer.tets), report.original.min);
+  const double good = std::min(goodQuality, report.original.min);
   return report.surface > 0 && (I.lowest >= good || I.options.outline == Outline::paper);
 }
 
 /// The ways of a layer until one is good; those put aside because they stay tangled are returned.
 std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& report) {
-  constexpr std::size_t huge = 200000;
-  const std::size_t tets = I.layer.tets;
   const bool isPaper = I.options.outline == Outline::paper;
-  // [choice] nor, there, whole squares where S_M of half squares is far from S: theirs is as far
-  auto isPoor = [&] {
-    return tets >= huge && report.surface > 0 && report.hausdorff > poorHausdorff * lc;
-  };
   std::vector<Outline> outlines{I.options.outline};
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
   std::vector<Selection> tried;
   std::vector<Way> aside;
   for (Outline outline : outlines)
-    if (!isGood(I, report) && (outline == outlines[0] || !isPoor()))
+    if (!isGood(I, report))
       for (const Way& way : extractWays(I, outline)) {
         const Selection& selected = way.extraction.selected;
         if (isGood(I, report) || std::find(tried.begin(), tried.end(), selected) != tried.end())
@@ -7483,7 +7473,7 @@ void prepare(Insertion& I, double lc, Course course) {
 void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report) {
   std::vector<std::pair<Course, std::vector<Way>>> aside;
   // [choice] below this lowest q the centres' course is tried, and the ways that were put aside
-  double enough = std::min(.45, report.original.min);
+  const double enough = std::min(.45, report.original.min);
   auto isEnough = [&] { return report.surface > 0 && I.lowest >= enough; };
   for (Course course : {Course::cheapest, Course::sides, Course::centres}) {
     const bool isSides = course == Course::sides;
@@ -7496,7 +7486,6 @@ void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report)
       if (report.surface == 0 && !I.layer.A.isMiddle) throw;  // 𝓣 itself fails, on every course
       I.leave(isSides ? "sides" : "middle", error);
     }
-    enough = std::min(enough, goodQuality(I.layer.tets));
   }
   for (const auto& [course, ways] : aside) {
     if (ways.empty() || isEnough()) continue;
