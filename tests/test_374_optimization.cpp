@@ -240,6 +240,29 @@ TEST_SUITE("3.7.4") {
     }
   }
 
+  TEST_CASE("Algorithm 2: choice, elements that are as good as flat are untangled") {
+    // a fixed node as far out of its place as no element is inverted: some are as good as flat
+    const Vec3 places[] = {{.25, .75, .5}, {.5, .75, .25}, {.75, .5, .5}}, out{.3, .5, .81};
+    for (const Vec3& place : places) {
+      CAPTURE(place.x);
+      OptimizeOptions options;
+      Mesh M = shakenCube(4, 0);
+      for (std::size_t n = 0; n < M.x.size(); ++n)
+        if (norm(M.x[n] - place) < 1e-9) options.fixed.push_back(static_cast<int>(n));
+      Vec3& x = M.x[options.fixed.at(0)];
+      double valid = 0, inverted = 1;
+      for (int halving = 0; halving < 60; ++halving) {
+        const double middle = .5 * (valid + inverted);
+        x = place + middle * out;
+        (shapes::countInverted(M) > 0 ? inverted : valid) = middle;
+      }
+      x = place + valid * out;
+      REQUIRE(shapes::countInverted(M) == 0);
+      REQUIRE(qualityStatistics(M).min < 1e-8);
+      CHECK(optimizeMesh(M, options).minQ > .3);
+    }
+  }
+
   TEST_CASE("Algorithm 2: departure, while a mesh is tangled what moves little is not visited") {
     const auto visitsOf = [](int acceleration) {
       OptimizeOptions options;
