@@ -3991,11 +3991,43 @@ TriangleTree::TriangleTree(const std::vector<Vec3>& x,
   }
 }
 
+namespace {
+
+/// Whether x is not farther than this from triangle i (in tree order); without roots, and mostly
+/// without division.
+bool isNear(const TriangleTree& tree, int i, Vec3 x, double distance) {
+  constexpr double rounding = 1e-9, needle2 = 1e-20;  // n of a needle: few digits of it are right
+  const std::array<Vec3, 3>& c = tree.corners[i];
+  const std::array<Vec3, 3> edge{c[1] - c[0], c[2] - c[1], c[0] - c[2]};
+  const Vec3 p = x - c[0], n = cross(edge[2], edge[0]);
+  const double n2 = norm2(n), height = dot(p, n), allowed2 = distance * distance * n2;
+  // what the distance to the triangle's plane leaves in it, squared, times n2
+  const double beside2 = (1 + rounding) * allowed2 - height * height +
+                         needle2 * norm2(p) * norm2(edge[0]) * norm2(edge[2]);
+  if (beside2 < 0) return false;
+  // the foot's barycentric coordinates, times n2, each the one that is 0 on the edge of its number
+  const double w0 = dot(cross(edge[0], p), n), w2 = dot(cross(edge[2], p), n);
+  const std::array<double, 3> w{w0, n2 - w0 - w2, w2};
+  for (int k = 0; k < 3; ++k)
+    if (w[k] < 0 && w[k] * w[k] > beside2 * norm2(edge[k])) return false;  // of the edge's line
+  if (w[0] > 0 && w[1] > 0 && w[2] > 0 && height * height <= allowed2) return true;
+  for (int k = 0; k < 3; ++k) {
+    const Vec3 q = x - c[k];
+    const double along = dot(q, edge[k]), length2 = norm2(edge[k]);
+    const double t = along <= 0 ? 0 : along >= length2 ? 1 : along / length2;
+    if (norm2(q - t * edge[k]) <= distance * distance) return true;
+  }
+  return false;
+}
+
+}  // namespace
+
 ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
   if (nodes.empty()) return best;
+  const double rounding = 1e-12 * norm(nodes[0].box.hi - nodes[0].box.lo);
   visitNearest(*this, 0, boxDistance2(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
-    if (isFarther(boxDistance2(boxOf(corners[i]), {x, x}), best.distance)) return;
+    if (!isNear(*this, i, x, (1 + 1e-9) * best.distance + rounding)) return;
     ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
     p.triangle = triangle[i];
     const bool lower = p.distance == best.distance && p.triangle < best.triangle;
@@ -4142,25 +4174,6 @@ bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
           segmentCrosses(S.points[m], S.points[n], cornersOf(S, b), at))
         return true;
     }
-  return false;
-}
-
-/// Whether x is not farther than this from triangle i (in tree order); without roots, and mostly
-/// without division.
-bool isNear(const TriangleTree& tree, int i, Vec3 x, double distance) {
-  constexpr double rounding = 1e-9;
-  const std::array<Vec3, 3>& c = tree.corners[i];
-  const Vec3 b1 = c[1] - c[0], b2 = c[2] - c[0], p = x - c[0], n = cross(b1, b2);
-  const double n2 = norm2(n), height = dot(p, n), far2 = distance * distance;
-  if (height * height > far2 * n2 * (1 + rounding)) return false;     // of the plane
-  const double w1 = dot(cross(p, b2), n), w2 = dot(cross(b1, p), n);  // the foot's, times n2
-  if (w1 > 0 && w2 > 0 && w1 + w2 < n2) return height * height <= far2 * n2;
-  for (int k = 0; k < 3; ++k) {
-    const Vec3 d = c[(k + 1) % 3] - c[k], q = x - c[k];
-    const double along = dot(q, d), length2 = norm2(d);
-    const double t = along <= 0 ? 0 : along >= length2 ? 1 : along / length2;
-    if (norm2(q - t * d) <= far2) return true;
-  }
   return false;
 }
 

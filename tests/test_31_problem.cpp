@@ -270,10 +270,27 @@ TEST_SUITE("3.1") {
 }
 
 TEST_SUITE("3.2") {
-  TEST_CASE("the nearest point of the tree is that of brute force") {
+  TEST_CASE("the nearest point of the tree is that of brute force, among needles too") {
     TriangleSurface S = bentGrid(9, 7);
+    const size_t triangles = S.triangles.size();
+    double apart = 1e-3;  // of the needles' third corner from the line of the two others
+    for (size_t i = 0; i < triangles; i += 2, apart = apart < 1e-14 ? 1e-3 : .1 * apart) {
+      const std::array<int, 3> t = S.triangles[i];
+      const Vec3 a = S.points[t[0]], b = S.points[t[1]], c = S.points[t[2]];
+      S.triangles[i] = {t[0], t[1], static_cast<int>(S.points.size())};
+      S.points.push_back(.4 * a + .6 * b + apart * (c - a));
+      S.triangles.push_back({t[1], t[2], S.triangles[i][2]});
+      S.triangles.push_back({t[2], t[0], S.triangles[i][2]});
+    }
     TriangleTree tree(S.points, S.triangles);
-    for (Vec3 x : scatteredPoints(100)) {
+    std::vector<Vec3> places = scatteredPoints(300);
+    for (const std::array<int, 3>& t : S.triangles) {  // on and just off S as well
+      const std::array<Vec3, 3> x{S.points[t[0]], S.points[t[1]], S.points[t[2]]};
+      const Vec3 inside = .5 * x[0] + .2 * x[1] + .3 * x[2];
+      for (double off : {0., 1e-9, 1e-4})
+        for (Vec3 p : {x[0], .5 * (x[1] + x[2]), inside}) places.push_back(p + Vec3{0, 0, off});
+    }
+    for (Vec3 x : places) {
       double least = 1e9;
       for (const std::array<int, 3>& t : S.triangles)
         least = std::min(
@@ -285,8 +302,25 @@ TEST_SUITE("3.2") {
       Vec3 fromWeights =
           p.w[0] * S.points[t[0]] + p.w[1] * S.points[t[1]] + p.w[2] * S.points[t[2]];
       CHECK(norm(fromWeights - p.point) < 1e-14);
-      CHECK(tree.closest(x, .5 * least).triangle == -1);
+      if (least > 0) CHECK(tree.closest(x, .5 * least).triangle == -1);
     }
+  }
+
+  TEST_CASE("the nearer one of two needles") {  // of whose normals few digits are right
+    const std::vector<Vec3> random = scatteredPoints(600);
+    for (double width : {1e-3, 1e-8, 1e-10, 1e-12})
+      for (size_t i = 0; i < random.size(); i += 3) {
+        const Vec3 a = random[i], along = random[i + 1], across = width * random[i + 2];
+        const Vec3 n = cross(along, random[i + 2]), up = (.1 / norm(n)) * n;
+        const Vec3 x = a + .7 * along + .3 * across + up;  // .1 above the first
+        std::vector<Vec3> points{a, a + along, a + .6 * along + across};
+        for (int k = 0; k < 3; ++k) points.push_back(points[k] + (2 + 1e-8) * up);
+        for (const std::array<int, 3>& first : {std::array<int, 3>{0, 1, 2}, {3, 4, 5}}) {
+          const TriangleTree tree(points, {first, {3 - first[0], 4 - first[0], 5 - first[0]}});
+          const ClosestPoint p = closestPointOnTriangle(x, points[0], points[1], points[2]);
+          CHECK(tree.closest(x).distance == p.distance);
+        }
+      }
   }
 
   TEST_CASE("the nearest point of a triangle is that of a search, for needles too") {
