@@ -6035,29 +6035,36 @@ int surfaceHealing(Bisection& B, int k) {
 
 namespace {
 
-using RealVector = std::vector<double>;
-
-double innerProduct(const RealVector& a, const RealVector& b) {
-  return std::inner_product(a.begin(), a.end(), b.begin(), 0.0);
+double innerProduct(const std::vector<Vec2>& a, const std::vector<Vec2>& b) {
+  double sum = 0;
+  for (std::size_t i = 0; i < a.size(); ++i) sum += a[i].x * b[i].x + a[i].y * b[i].y;
+  return sum;
 }
 
-double normOf(const RealVector& a) { return std::sqrt(innerProduct(a, a)); }
+double normOf(const std::vector<Vec2>& a) { return std::sqrt(innerProduct(a, a)); }
 
 /// y += t a
-void addMultiple(RealVector& y, double t, const RealVector& a) {
-  for (std::size_t i = 0; i < y.size(); ++i) y[i] += t * a[i];
+void addMultiple(std::vector<Vec2>& y, double t, const std::vector<Vec2>& a) {
+  for (std::size_t i = 0; i < y.size(); ++i) y[i] = y[i] + t * a[i];
 }
 
-RealVector productOf(const SparseMatrix& A, const RealVector& x) {
-  RealVector y(x.size(), 0.0);
-  for (std::size_t i = 0; i < y.size(); ++i)
-    for (int k = A.start[i]; k < A.start[i + 1]; ++k) y[i] += A.value[k] * x[A.column[k]];
+/// Σ A_ij x_j over the entries [from, to) of row i.
+Vec2 partOfRow(const SparseMatrix& A, int from, int to, const std::vector<Vec2>& x) {
+  Vec2 sum;
+  for (int k = from; k < to; ++k) sum = sum + A.value[k] * x[A.column[k]];
+  return sum;
+}
+
+std::vector<Vec2> productOf(const SparseMatrix& A, const std::vector<Vec2>& x) {
+  std::vector<Vec2> y(x.size());
+  for (std::size_t i = 0; i < y.size(); ++i) y[i] = partOfRow(A, A.start[i], A.start[i + 1], x);
   return y;
 }
 
 /// b − A x
-RealVector residualOf(const SparseMatrix& A, const RealVector& b, const RealVector& x) {
-  RealVector r = b;
+std::vector<Vec2> residualOf(const SparseMatrix& A, const std::vector<Vec2>& b,
+                             const std::vector<Vec2>& x) {
+  std::vector<Vec2> r = b;
   addMultiple(r, -1, productOf(A, x));
   return r;
 }
@@ -6067,17 +6074,16 @@ constexpr double overRelaxation = 1.75;
 
 /// Solves M z = r with M = (D + ωL) D⁻¹ (D + ωU), the symmetric successive over-relaxation (SSOR)
 /// preconditioner of A = L + D + U; `diagonal` are the entries of D.
-RealVector precondition(const SparseMatrix& A, const std::vector<int>& diagonal, RealVector z) {
+std::vector<Vec2> precondition(const SparseMatrix& A, const std::vector<int>& diagonal,
+                               std::vector<Vec2> z) {
   const int n = static_cast<int>(z.size());
   for (int i = 0; i < n; ++i) {  // (D + ωL) z = r
-    double sum = 0;
-    for (int k = A.start[i]; k < diagonal[i]; ++k) sum += A.value[k] * z[A.column[k]];
-    z[i] = (z[i] - overRelaxation * sum) / A.value[diagonal[i]];
+    const Vec2 sum = partOfRow(A, A.start[i], diagonal[i], z);
+    z[i] = (1 / A.value[diagonal[i]]) * (z[i] - overRelaxation * sum);
   }
   for (int i = n - 1; i >= 0; --i) {  // (D + ωU) z' = D z
-    double sum = 0;
-    for (int k = diagonal[i] + 1; k < A.start[i + 1]; ++k) sum += A.value[k] * z[A.column[k]];
-    z[i] -= overRelaxation * sum / A.value[diagonal[i]];
+    const Vec2 sum = partOfRow(A, diagonal[i] + 1, A.start[i + 1], z);
+    z[i] = z[i] - (overRelaxation / A.value[diagonal[i]]) * sum;
   }
   return z;
 }
@@ -6098,20 +6104,20 @@ std::vector<int> diagonalOf(const SparseMatrix& A) {
 
 /// BiCGSTAB from x until |r| <= goal, the bound or a breakdown (van der Vorst 1992).
 ///   returns the iterations
-int bicgstabRun(const SparseMatrix& A, const std::vector<int>& diagonal, const RealVector& b,
-                RealVector& x, double goal, int maxIterations) {
-  RealVector r = residualOf(A, b, x), p = r;
-  const RealVector r0 = r;
+int bicgstabRun(const SparseMatrix& A, const std::vector<int>& diagonal, const std::vector<Vec2>& b,
+                std::vector<Vec2>& x, double goal, int maxIterations) {
+  std::vector<Vec2> r = residualOf(A, b, x), p = r;
+  const std::vector<Vec2> r0 = r;
   double rho = innerProduct(r0, r);
   for (int iteration = 1; iteration <= maxIterations; ++iteration) {
-    const RealVector pHat = precondition(A, diagonal, p), v = productOf(A, pHat);
+    const std::vector<Vec2> pHat = precondition(A, diagonal, p), v = productOf(A, pHat);
     const double alpha = rho / innerProduct(r0, v);
     if (!std::isfinite(alpha)) return iteration;
     addMultiple(x, alpha, pHat);
     addMultiple(r, -alpha, v);  // r is now s
     if (normOf(r) <= goal) return iteration;
 
-    const RealVector sHat = precondition(A, diagonal, r), t = productOf(A, sHat);
+    const std::vector<Vec2> sHat = precondition(A, diagonal, r), t = productOf(A, sHat);
     const double omega = innerProduct(t, r) / innerProduct(t, t);
     if (!std::isfinite(omega)) return iteration;
     addMultiple(x, omega, sHat);
@@ -6129,7 +6135,7 @@ int bicgstabRun(const SparseMatrix& A, const std::vector<int>& diagonal, const R
 
 }  // namespace
 
-int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
+int solveBiCGSTAB(const SparseMatrix& A, const std::vector<Vec2>& b, std::vector<Vec2>& x,
                   double tolerance, int maxIterations) {
   const std::vector<int> diagonal = diagonalOf(A);
   const double goal = tolerance * normOf(b);
@@ -6165,23 +6171,26 @@ struct Entry {
   int row, column;
   double value;
 };
-SparseMatrix compressRows(std::vector<Entry> entries, std::size_t rows) {
-  std::stable_sort(entries.begin(), entries.end(), [](const Entry& a, const Entry& b) {
-    return a.row != b.row ? a.row < b.row : a.column < b.column;
-  });
+SparseMatrix compressRows(const std::vector<Entry>& entries, std::size_t rows) {
+  std::vector<std::size_t> first(rows + 1, 0);  // of a row's entries in byRow
+  for (const Entry& e : entries) ++first[e.row + 1];
+  std::partial_sum(first.begin(), first.end(), first.begin());
+  std::vector<Entry> byRow(entries.size());
+  std::vector<std::size_t> next = first;
+  for (const Entry& e : entries) byRow[next[e.row]++] = e;
+
   SparseMatrix A;
-  A.start.assign(rows + 1, 0);
-  for (std::size_t k = 0; k < entries.size(); ++k) {
-    const Entry& e = entries[k];
-    if (k > 0 && e.row == entries[k - 1].row && e.column == entries[k - 1].column) {
-      A.value.back() += e.value;
-    } else {
-      A.column.push_back(e.column);
-      A.value.push_back(e.value);
-      ++A.start[e.row + 1];
-    }
+  A.start.push_back(0);
+  for (std::size_t i = 0; i < rows; ++i) {
+    const auto row = byRow.begin() + first[i], end = byRow.begin() + first[i + 1];
+    std::stable_sort(row, end, [](const Entry& a, const Entry& b) { return a.column < b.column; });
+    for (auto e = row; e != end; ++e)
+      if (e != row && e->column == e[-1].column)
+        A.value.back() += e->value;
+      else
+        A.column.push_back(e->column), A.value.push_back(e->value);
+    A.start.push_back(static_cast<int>(A.column.size()));
   }
-  std::partial_sum(A.start.begin(), A.start.end(), A.start.begin());
   return A;
 }
 
@@ -6204,7 +6213,7 @@ SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
       entries.push_back({i, j, tangent / norm(a)});
       entries.push_back({i, k, tangent / norm(b)});
     }
-  SparseMatrix lambda = compressRows(std::move(entries), points.size());
+  SparseMatrix lambda = compressRows(entries, points.size());
   for (std::size_t i = 0; i < points.size(); ++i) {
     const auto from = lambda.value.begin() + lambda.start[i];
     const auto to = lambda.value.begin() + lambda.start[i + 1];
@@ -6217,7 +6226,7 @@ SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
 std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
                                           const std::vector<char>& isRim, std::vector<Vec2> u,
                                           const std::vector<double>& mu,
-                                          const std::vector<Vec2>& anchor, const Crew& crew) {
+                                          const std::vector<Vec2>& anchor) {
   // Rows are the inner points, ring by ring from the rim: an order that suits the preconditioner.
   std::vector<int> row(u.size(), -1), point;
   auto add = [&](int n) {
@@ -6231,7 +6240,7 @@ std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
   for (std::size_t q = 0; q < point.size(); ++q)
     for (int k = lambda.start[point[q]]; k < lambda.start[point[q] + 1]; ++k) add(lambda.column[k]);
   std::vector<Entry> entries;
-  std::array<RealVector, 2> b, x;  // in the two coordinates
+  std::vector<Vec2> b, x;
   for (int n : point) {
     entries.push_back({row[n], row[n], 1 + mu[n]});
     Vec2 right = mu[n] * anchor[n];
@@ -6242,14 +6251,11 @@ std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
       else
         entries.push_back({row[n], row[j], -lambda.value[k]});
     }
-    b[0].push_back(right.x);
-    b[1].push_back(right.y);
-    x[0].push_back(u[n].x);
-    x[1].push_back(u[n].y);
+    b.push_back(right);
+    x.push_back(u[n]);
   }
-  const SparseMatrix A = compressRows(std::move(entries), point.size());
-  crew.forPieces(0, 2, 1, [&](int c, int, int) { solveBiCGSTAB(A, b[c], x[c]); });
-  for (int n : point) u[n] = {x[0][row[n]], x[1][row[n]]};
+  solveBiCGSTAB(compressRows(entries, point.size()), b, x);
+  for (int n : point) u[n] = x[row[n]];
   return u;
 }
 
@@ -6265,12 +6271,11 @@ std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangl
 
 std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
                                          const std::vector<std::array<int, 3>>& triangles,
-                                         const std::vector<char>& isRim, std::vector<Vec2> u,
-                                         const Crew& crew) {
+                                         const std::vector<char>& isRim, std::vector<Vec2> u) {
   const SparseMatrix lambda = meanValueWeights(points, triangles, isRim);
   for (std::size_t i = 0; i < u.size(); ++i)
     if (!isRim[i]) u[i] = {.5, .5};
-  u = anchoredParametrization(lambda, isRim, u, RealVector(u.size(), 0.0), u, crew);
+  u = anchoredParametrization(lambda, isRim, u, std::vector<double>(u.size(), 0.0), u);
   const std::vector<int> flipped = flippedTriangles(triangles, u);
   if (!flipped.empty())
     throw MethodError("insertSurface (§3.6): Floater's map is self-folding in parameter space: " +
@@ -6442,7 +6447,7 @@ Vec2 rimParameter(const std::array<double, 4>& cornerS, double L, double s) {
 
 }  // namespace
 
-SurfaceParametrization parametrizeSurface(const SurfaceDistance& S, const Crew& crew) {
+SurfaceParametrization parametrizeSurface(const SurfaceDistance& S) {
   const RimCorners corners = rimCorners(S);
   std::vector<int> loop = S.rim;
   std::rotate(loop.begin(), loop.begin() + corners.at[0], loop.end());
@@ -6460,7 +6465,7 @@ SurfaceParametrization parametrizeSurface(const SurfaceDistance& S, const Crew& 
   Phi.surface.points = S.S.points;
   Phi.surface.triangles = S.S.triangles;
   Phi.surface.name = S.S.name;
-  Phi.surface.u = floaterParametrization(S.S.points, S.S.triangles, S.isRimPoint, u, crew);
+  Phi.surface.u = floaterParametrization(S.S.points, S.S.triangles, S.isRimPoint, u);
   return Phi;
 }
 
@@ -6527,7 +6532,7 @@ ApproximatingSurface approximatingSurface(const Mesh& M, int k, const SurfaceDis
 /// The rim nodes of S_M matched to the four corners of S in cyclic order, with the least sum of
 /// squared distances less bonus: for each partner of the first, dynamic programming over the
 /// others.
-std::array<int, 4> matchedCorners(const std::vector<Vec3>& rim, const RealVector& bonus,
+std::array<int, 4> matchedCorners(const std::vector<Vec3>& rim, const std::vector<double>& bonus,
                                   const std::array<Vec3, 4>& corners) {
   const int m = static_cast<int>(rim.size());
   auto cost = [&](int i, int c) { return norm2(rim[i] - corners[c]) - bonus[i]; };
@@ -6595,7 +6600,7 @@ std::vector<int> followArc(const Curve& rim, const Curve& rimM, const TriangleTr
   for (int k = 1; k <= count; ++k)
     nearFrom[k] = treeM.closest(at[k], slitReach * h).triangle < 0 ? k : nearFrom[k - 1];
   // least[k]: cost of the nodes so far with the last at sample k; step[e][k]: its step, 0: none
-  RealVector least(count + 1, beyondAll), before, stepCost;
+  std::vector<double> least(count + 1, beyondAll), before, stepCost;
   std::vector<std::vector<int>> step(edges, std::vector<int>(count + 1, 0));
   least[0] = 0;
   for (int e = 0; e < edges; ++e) {
@@ -6656,8 +6661,8 @@ std::pair<int, double> nearestPair(const std::vector<Vec3>& rimM, const Curve& r
 
 /// The bonus of S_M's rim nodes as partners of corners, squared length unit. Their turn is π less
 /// the angles of their triangles, so that a fold of S_M is no turn. [rim]
-RealVector cornerBonus(const ApproximatingSurface& SM) {
-  RealVector turn(SM.S.points.size(), 180 * degree), bonus;
+std::vector<double> cornerBonus(const ApproximatingSurface& SM) {
+  std::vector<double> turn(SM.S.points.size(), 180 * degree), bonus;
   for (const std::array<int, 3>& t : SM.S.triangles)
     for (int i = 0; i < 3; ++i) {
       const Vec3 p = SM.S.points[t[i]];
@@ -6766,7 +6771,7 @@ std::vector<char> holdBridges(const ApproximatingSurface& SM, const std::vector<
 /// map with the fewest: without anchors the limbs of S_M move along S by many h.
 ///   u  set at the rim
 std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const Parametrization& Phi,
-                              std::vector<Vec2> u, const Crew& crew) {
+                              std::vector<Vec2> u) {
   const std::vector<Vec2>& uS = Phi.u;
   std::vector<double> mu(u.size(), 0.0);
   for (std::size_t i = 0; i < u.size(); ++i) {
@@ -6783,7 +6788,7 @@ std::vector<Vec2> anchoredMap(const ApproximatingSurface& SM, const Parametrizat
   std::vector<Vec2> best;
   std::size_t fewest = SM.S.triangles.size() + 1;
   for (int rings = 0; rings <= maxRings; rings = 2 * rings + 1) {
-    u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor, crew);
+    u = anchoredParametrization(lambda, SM.isRim, u, mu, anchor);
     std::vector<int> flipped;
     for (int t : flippedTriangles(SM.S.triangles, u))
       if (!bridges[t]) flipped.push_back(t);
@@ -6836,8 +6841,8 @@ ProjectionReport projectTo(Mesh& M, const SurfaceDistance& S, SurfaceParametriza
   std::vector<Vec2> u(SM.node.size());  // ϕ_M⁻¹, eq. (3)
   for (std::size_t i = 0; i < SM.rim.size(); ++i)
     u[SM.rim[i]] = rimParameter(Phi.cornerS, Phi.rim.s.back(), targets.s[i]);
-  u = followRim ? anchoredMap(SM, Phi.surface, u, crew)
-                : floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u, crew);
+  u = followRim ? anchoredMap(SM, Phi.surface, u)
+                : floaterParametrization(SM.S.points, SM.S.triangles, SM.isRim, u);
 
   Phi.surface.rim = static_cast<int>(M.curves.size()) + 1;
   Phi.rim.sides[0].surface = k;
@@ -6853,8 +6858,8 @@ ProjectionReport projectTo(Mesh& M, const SurfaceDistance& S, SurfaceParametriza
 }
 
 /// ϕ, eq. (3), with its locator.
-SurfaceParametrization locatedParametrization(const SurfaceDistance& S, const Crew& crew) {
-  SurfaceParametrization Phi = parametrizeSurface(S, crew);
+SurfaceParametrization locatedParametrization(const SurfaceDistance& S) {
+  SurfaceParametrization Phi = parametrizeSurface(S);
   buildLocator(Phi.surface);
   return Phi;
 }
@@ -6866,7 +6871,7 @@ ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool
   splitChords(split);
   const SurfaceDistance S(split);
   const Crew alone;
-  return projectTo(M, S, locatedParametrization(S, alone), followRim, alone);
+  return projectTo(M, S, locatedParametrization(S), followRim, alone);
 }
 
 // ==== 3. Surface insertion =======================================================================
@@ -7224,7 +7229,7 @@ void project(Insertion& I, Mesh& M, InsertReport& report) {
   const std::vector<double> healed = qualities(M, I.original.x, I.q);
   const std::vector<Vec3> before = M.x;
   report.refined = qualityStatistics(healed);
-  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S, I.crew);
+  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S);
   const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim, I.crew);
   report.tangentialShift = projection.tangentialShift;
   report.projected = qualityStatistics(qualities(M, before, healed));

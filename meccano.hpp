@@ -893,12 +893,13 @@ struct SparseMatrix {
   std::vector<double> value;  // [entries]
 };
 
-/// Solves A x = b by BiCGSTAB with the SSOR preconditioner.
+/// Solves A x = b by BiCGSTAB with the SSOR preconditioner, both coordinates at once: as one system
+/// of twice the size.
 ///   x          start value on entry, the solution on return
 ///   tolerance  of |b - A x| / |b|
 ///   returns    the iterations
 ///   errors     SolverError: the residual reached; a row without diagonal entry
-int solveBiCGSTAB(const SparseMatrix& A, const std::vector<double>& b, std::vector<double>& x,
+int solveBiCGSTAB(const SparseMatrix& A, const std::vector<Vec2>& b, std::vector<Vec2>& x,
                   double tolerance = 1e-12, int maxIterations = 5000);
 
 // ==== 3.6 Surface projection ====================================================================
@@ -919,15 +920,13 @@ SparseMatrix meanValueWeights(const std::vector<Vec3>& points,
 ///   errors  SolverError; MethodError where a parametric triangle is not counter-clockwise
 std::vector<Vec2> floaterParametrization(const std::vector<Vec3>& points,
                                          const std::vector<std::array<int, 3>>& triangles,
-                                         const std::vector<char>& isRim, std::vector<Vec2> u,
-                                         const Crew& crew = Crew());
+                                         const std::vector<char>& isRim, std::vector<Vec2> u);
 
 /// [§3.6 departure] (1 + μ_i) u_i − Σ λ_ij u_j = μ_i a_i inside pulls u_i to its anchor a_i.
 std::vector<Vec2> anchoredParametrization(const SparseMatrix& lambda,
                                           const std::vector<char>& isRim, std::vector<Vec2> u,
                                           const std::vector<double>& mu,
-                                          const std::vector<Vec2>& anchor,
-                                          const Crew& crew = Crew());
+                                          const std::vector<Vec2>& anchor);
 
 /// Triangles of 𝓤 that are not counter-clockwise.
 std::vector<int> flippedTriangles(const std::vector<std::array<int, 3>>& triangles,
@@ -953,7 +952,7 @@ struct SurfaceParametrization {
   std::array<double, 4> cornerS;  // arc length of the four corners, the first is 0
   std::array<bool, 4> sharp;
 };
-SurfaceParametrization parametrizeSurface(const SurfaceDistance& S, const Crew& crew = Crew());
+SurfaceParametrization parametrizeSurface(const SurfaceDistance& S);
 
 struct ProjectionReport {
   double tangentialShift = 0;    // largest distance of x' from the point of S nearest to x

@@ -101,7 +101,7 @@ double literalWeight(const TriangleSurface& S, int i, int j) {
 }
 
 /// Gaussian elimination with row pivoting.
-std::vector<double> denseSolve(const SparseMatrix& A, std::vector<double> b) {
+std::vector<Vec2> denseSolve(const SparseMatrix& A, std::vector<Vec2> b) {
   const int n = static_cast<int>(b.size());
   std::vector<std::vector<double>> a(n, std::vector<double>(n, 0.0));
   for (int i = 0; i < n; ++i)
@@ -115,12 +115,12 @@ std::vector<double> denseSolve(const SparseMatrix& A, std::vector<double> b) {
     for (int r = c + 1; r < n; ++r) {
       double factor = a[r][c] / a[c][c];
       for (int k = c; k < n; ++k) a[r][k] -= factor * a[c][k];
-      b[r] -= factor * b[c];
+      b[r] = b[r] - factor * b[c];
     }
   }
   for (int r = n - 1; r >= 0; --r) {
-    for (int k = r + 1; k < n; ++k) b[r] -= a[r][k] * b[k];
-    b[r] /= a[r][r];
+    for (int k = r + 1; k < n; ++k) b[r] = b[r] - a[r][k] * b[k];
+    b[r] = (1 / a[r][r]) * b[r];
   }
   return b;
 }
@@ -209,11 +209,14 @@ TEST_SUITE("3.6") {
     for (int n : {1, 2, 13, 60}) {
       CAPTURE(n);
       SparseMatrix A = someMatrix(n, 6.5);
-      std::vector<double> b(n), x(n, 0.0);
-      for (int i = 0; i < n; ++i) b[i] = std::cos(1.0 * i * i);
+      std::vector<Vec2> b(n), x(n);
+      for (int i = 0; i < n; ++i) b[i] = {std::cos(1.0 * i * i), 1.0 * i};
       solveBiCGSTAB(A, b, x);
-      std::vector<double> exact = denseSolve(A, b);
-      for (int i = 0; i < n; ++i) CHECK(x[i] == doctest::Approx(exact[i]).epsilon(1e-9));
+      const std::vector<Vec2> exact = denseSolve(A, b);
+      for (int i = 0; i < n; ++i) {
+        CHECK(x[i].x == doctest::Approx(exact[i].x).epsilon(1e-9));
+        CHECK(x[i].y == doctest::Approx(exact[i].y).epsilon(1e-9));
+      }
     }
   }
 
@@ -221,14 +224,17 @@ TEST_SUITE("3.6") {
     // Elimination in the first column leaves 0 as second pivot; the third column saves the matrix
     // itself.
     SparseMatrix A{{0, 2, 5, 7}, {0, 1, 0, 1, 2, 1, 2}, {1, 1, 1, 1, 1, -1, 2}};
-    std::vector<double> b{1, 2, 3}, x(3, 0.0), exact = denseSolve(A, b);
+    std::vector<Vec2> b{{1, 3}, {2, 0}, {3, -1}}, x(3), exact = denseSolve(A, b);
     solveBiCGSTAB(A, b, x);
-    for (int i = 0; i < 3; ++i) CHECK(x[i] == doctest::Approx(exact[i]));
+    for (int i = 0; i < 3; ++i) {
+      CHECK(x[i].x == doctest::Approx(exact[i].x));
+      CHECK(x[i].y == doctest::Approx(exact[i].y));
+    }
   }
 
   TEST_CASE("BiCGSTAB reports the residual of a system without solution") {
     SparseMatrix A{{0, 2, 4}, {0, 1, 0, 1}, {1, 1, 1, 1}};
-    std::vector<double> b{1, 2}, x(2, 0.0);
+    std::vector<Vec2> b{{1, 1}, {2, 1}}, x(2);
     try {
       solveBiCGSTAB(A, b, x);
       FAIL("no exception");
