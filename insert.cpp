@@ -3993,32 +3993,49 @@ TriangleTree::TriangleTree(const std::vector<Vec3>& x,
 
 namespace {
 
-/// Whether x is not farther than this from triangle i (in tree order); without roots, and mostly
-/// without division.
-bool isNear(const TriangleTree& tree, int i, Vec3 x, double distance) {
-  constexpr double rounding = 1e-9, needle2 = 1e-20;  // n of a needle: few digits of it are right
-  const std::array<Vec3, 3>& c = tree.corners[i];
-  const std::array<Vec3, 3> edge{c[1] - c[0], c[2] - c[1], c[0] - c[2]};
-  const Vec3 p = x - c[0], n = cross(edge[2], edge[0]);
-  const double n2 = norm2(n), height = dot(p, n), allowed2 = distance * distance * n2;
-  // what the distance to the triangle's plane leaves in it, squared, times n2
-  const double beside2 = (1 + rounding) * allowed2 - height * height +
-                         needle2 * norm2(p) * norm2(edge[0]) * norm2(edge[2]);
-  if (beside2 < 0) return false;
-  // the foot's barycentric coordinates, times n2, each the one that is 0 on the edge of its number
-  const double w0 = dot(cross(edge[0], p), n), w2 = dot(cross(edge[2], p), n);
-  const std::array<double, 3> w{w0, n2 - w0 - w2, w2};
-  for (int k = 0; k < 3; ++k)
-    if (w[k] < 0 && w[k] * w[k] > beside2 * norm2(edge[k])) return false;  // of the edge's line
-  if (w[0] > 0 && w[1] > 0 && w[2] > 0 && height * height <= allowed2) return true;
-  for (int k = 0; k < 3; ++k) {
-    const Vec3 q = x - c[k];
-    const double along = dot(q, edge[k]), length2 = norm2(edge[k]);
-    const double t = along <= 0 ? 0 : along >= length2 ? 1 : along / length2;
-    if (norm2(q - t * edge[k]) <= distance * distance) return true;
+/// Tells of points whether they are not farther than a distance from one triangle; without roots,
+/// and mostly without division.
+class NearTriangle {
+ public:
+  NearTriangle() = default;
+  explicit NearTriangle(const std::array<Vec3, 3>& corners)
+      : c_(corners),
+        edge_{c_[1] - c_[0], c_[2] - c_[1], c_[0] - c_[2]},
+        length2_{norm2(edge_[0]), norm2(edge_[1]), norm2(edge_[2])},
+        n_(cross(edge_[2], edge_[0])),
+        inward0_(cross(n_, edge_[0])),
+        inward2_(cross(n_, edge_[2])),
+        n2_(norm2(n_)) {}
+  bool operator()(Vec3 x, double distance) const {
+    constexpr double rounding = 1e-9, needle2 = 1e-20;  // n of a needle: few digits of it are right
+    const Vec3 p = x - c_[0];
+    const double height = dot(p, n_), allowed2 = distance * distance * n2_;
+    // what the distance to the triangle's plane leaves in it, squared, times n2
+    const double beside2 = (1 + rounding) * allowed2 - height * height +
+                           needle2 * norm2(p) * length2_[0] * length2_[2];
+    if (beside2 < 0) return false;
+    // the foot's barycentric coordinates, times n2, each the one that is 0 on the edge of its
+    // number
+    const double w0 = dot(p, inward0_), w2 = dot(p, inward2_);
+    const std::array<double, 3> w{w0, n2_ - w0 - w2, w2};
+    for (int k = 0; k < 3; ++k)
+      if (w[k] < 0 && w[k] * w[k] > beside2 * length2_[k]) return false;  // of the edge's line
+    if (w[0] > 0 && w[1] > 0 && w[2] > 0 && height * height <= allowed2) return true;
+    for (int k = 0; k < 3; ++k) {
+      const Vec3 q = x - c_[k];
+      const double along = dot(q, edge_[k]);
+      const double t = along <= 0 ? 0 : along >= length2_[k] ? 1 : along / length2_[k];
+      if (norm2(q - t * edge_[k]) <= distance * distance) return true;
+    }
+    return false;
   }
-  return false;
-}
+
+ private:
+  std::array<Vec3, 3> c_, edge_;
+  std::array<double, 3> length2_;
+  Vec3 n_, inward0_, inward2_;  // the edges' normals in the plane, of edges 0 and 2
+  double n2_;
+};
 
 }  // namespace
 
@@ -4027,7 +4044,7 @@ ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   if (nodes.empty()) return best;
   const double rounding = 1e-12 * norm(nodes[0].box.hi - nodes[0].box.lo);
   visitNearest(*this, 0, boxDistance2(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
-    if (!isNear(*this, i, x, (1 + 1e-9) * best.distance + rounding)) return;
+    if (!NearTriangle(corners[i])(x, (1 + 1e-9) * best.distance + rounding)) return;
     ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
     p.triangle = triangle[i];
     const bool lower = p.distance == best.distance && p.triangle < best.triangle;
@@ -4183,7 +4200,7 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
   double bound = distance;  // −1 ends the search
   int found = -1;
   visitNearest(tree, 0, boxDistance2(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
-    if (found < 0 && isNear(tree, i, x, distance)) found = i, bound = -1;
+    if (found < 0 && NearTriangle(tree.corners[i])(x, distance)) found = i, bound = -1;
   });
   return found;
 }
@@ -4195,11 +4212,12 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
                       Width largest, int from, int to) {
   constexpr double mostSteps = 1000;
   // the triangles of B that were near last: neighbours in A are so to the same
-  std::array<int, 4> recent{};
+  std::array<NearTriangle, 4> recent;
+  recent.fill(NearTriangle(B.corners[0]));
   const auto isNearRecent = [&](Vec3 p) {
-    for (int& t : recent)
-      if (isNear(B, t, p, largest.distance)) {
-        std::swap(t, recent[0]);
+    for (NearTriangle& isNear : recent)
+      if (isNear(p, largest.distance)) {
+        if (&isNear != &recent[0]) std::swap(isNear, recent[0]);
         return true;
       }
     return false;
@@ -4207,7 +4225,9 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
   const auto findNear = [&](Vec3 p) {
     if (isNearRecent(p)) return true;
     const int near = triangleWithin(B, p, largest.distance);
-    if (near >= 0) std::rotate(recent.begin(), recent.end() - 1, recent.end()), recent[0] = near;
+    if (near >= 0)
+      std::rotate(recent.begin(), recent.end() - 1, recent.end()),
+          recent[0] = NearTriangle(B.corners[near]);
     return near >= 0;
   };
   KeyMap had(3 * (to - from) / 2);  // edge → steps of the lattice whose points on it were looked at
@@ -4215,7 +4235,7 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
     const std::array<Vec3, 3>& c = A.corners[t];
     // the distance from one triangle is a convex function: on another one largest at a corner
     findNear((1. / 3) * (c[0] + c[1] + c[2]));
-    const auto isNearOne = [&](Vec3 p) { return isNear(B, recent[0], p, largest.distance); };
+    const auto isNearOne = [&](Vec3 p) { return recent[0](p, largest.distance); };
     if (isNearOne(c[0]) && isNearOne(c[1]) && isNearOne(c[2])) continue;
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
