@@ -3994,7 +3994,8 @@ TriangleTree::TriangleTree(const std::vector<Vec3>& x,
 namespace {
 
 /// Tells of points whether they are not farther than a distance from one triangle; without roots,
-/// and mostly without division.
+/// and mostly without division. Of a needle, whose normal has few correct digits, by its nearest
+/// point.
 class NearTriangle {
  public:
   NearTriangle() = default;
@@ -4005,17 +4006,17 @@ class NearTriangle {
         n_(cross(edge_[2], edge_[0])),
         inward0_(cross(n_, edge_[0])),
         inward2_(cross(n_, edge_[2])),
-        n2_(norm2(n_)) {}
+        n2_(norm2(n_)),
+        needle_(!(n2_ > needleSine * needleSine * length2_[0] * length2_[2])) {}
   bool operator()(Vec3 x, double distance) const {
-    constexpr double rounding = 1e-9, needle2 = 1e-20;  // n of a needle: few digits of it are right
+    constexpr double rounding = 1e-9;  // of n and what follows, with room
+    if (needle_) return closestPointOnTriangle(x, c_[0], c_[1], c_[2]).distance <= distance;
     const Vec3 p = x - c_[0];
     const double height = dot(p, n_), allowed2 = distance * distance * n2_;
     // what the distance to the triangle's plane leaves in it, squared, times n2
-    const double beside2 = (1 + rounding) * allowed2 - height * height +
-                           needle2 * norm2(p) * length2_[0] * length2_[2];
+    const double beside2 = (1 + rounding) * allowed2 - height * height;
     if (beside2 < 0) return false;
-    // the foot's barycentric coordinates, times n2, each the one that is 0 on the edge of its
-    // number
+    // the foot's barycentric coordinates, times n2: those that are 0 on edges 0, 1, 2
     const double w0 = dot(p, inward0_), w2 = dot(p, inward2_);
     const std::array<double, 3> w{w0, n2_ - w0 - w2, w2};
     for (int k = 0; k < 3; ++k)
@@ -4031,10 +4032,12 @@ class NearTriangle {
   }
 
  private:
+  static constexpr double needleSine = 1e-3;  // of the angle at corner 0
   std::array<Vec3, 3> c_, edge_;
   std::array<double, 3> length2_;
   Vec3 n_, inward0_, inward2_;  // the edges' normals in the plane, of edges 0 and 2
   double n2_;
+  bool needle_;
 };
 
 }  // namespace
@@ -4042,9 +4045,11 @@ class NearTriangle {
 ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
   if (nodes.empty()) return best;
-  const double rounding = 1e-12 * norm(nodes[0].box.hi - nodes[0].box.lo);
+  // so much nearer NearTriangle sees for certain, and equal distances go to the lowest triangle
+  constexpr double ofDistance = 1e-9, ofDiagonal = 1e-12;
+  const double rounding = ofDiagonal * norm(nodes[0].box.hi - nodes[0].box.lo);
   visitNearest(*this, 0, boxDistance2(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
-    if (!NearTriangle(corners[i])(x, (1 + 1e-9) * best.distance + rounding)) return;
+    if (!NearTriangle(corners[i])(x, (1 + ofDistance) * best.distance + rounding)) return;
     ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
     p.triangle = triangle[i];
     const bool lower = p.distance == best.distance && p.triangle < best.triangle;

@@ -783,7 +783,7 @@ struct Smoother {
   double wake = 0;  // displacement, relative to the shortest edge, from which neighbours awake
 
   double delta = 0;      // of the sweep, relative to the mean σ
-  double flat = 0;       // volume of flat elements, of the cube of their edges
+  bool flat = false;     // elements that are as good as flat count as inverted
   bool tangled = false;  // of the mesh, and the rung of the schedule for μ
   bool stuck = false;    // still, after some sweeps
   int rung = 0;
@@ -1162,21 +1162,37 @@ void build(Smoother& S) {
   fillSheets(S, faces);
 }
 
-/// σ of an element; of one that counts as flat no more than 0.
+Mat3 jacobianOf(const Smoother& S, int E) {
+  const std::array<int, 4>& tet = S.M.tets[E];
+  const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
+  const Vec3 x = S.M.x[tet[0]];
+  Mat3 J{};
+  for (int k = 1; k < 4; ++k) J = J + outer(S.M.x[tet[k]] - x, g[k]);
+  return J;
+}
+
 double sigmaOf(const Smoother& S, int E) {
-  const std::array<Vec3, 4> x = cornersOf(S.M.x, S.M.tets[E]);
-  const double volume6 = signedVolume6(x);
-  const double edges2 = norm2(x[1] - x[0]) + norm2(x[2] - x[0]) + norm2(x[3] - x[0]);
-  const double sigma = volume6 * S.corners[4 * S.shapeOf[E]].perVolume;
-  return std::abs(volume6) <= S.flat * edges2 * std::sqrt(edges2) ? std::min(sigma, 0.) : sigma;
+  return signedVolume6(cornersOf(S.M.x, S.M.tets[E])) * S.corners[4 * S.shapeOf[E]].perVolume;
+}
+
+/// [choice] Of lower q a valid element counts as flat while `Smoother::flat`.
+constexpr double flatQuality = 1e-4;
+
+/// Whether q = 3 σ^(2/3)/‖J‖² is below flatQuality.
+bool isFlat(const Smoother& S, int E) {
+  constexpr double third = flatQuality / 3;
+  const Mat3 J = jacobianOf(S, E);
+  const double sigma = det(J), size2 = third * norm2(J);
+  return sigma * sigma < size2 * size2 * size2;
 }
 
 struct Validity {
-  int inverted = 0;
-  double sigmaMin = unbounded;
+  int inverted = 0, flat = 0;
+  double sigmaMin = unbounded;  // 0 at most where an element is flat
 
   void operator+=(const Validity& other) {
     inverted += other.inverted;
+    flat += other.flat;
     sigmaMin = std::min(sigmaMin, other.sigmaMin);
   }
 };
@@ -1185,7 +1201,12 @@ Validity validity(const Smoother& S) {
     Validity v;
     for (int i = from; i < to; ++i) {
       const double sigma = sigmaOf(S, S.elements[i]);
-      v += {sigma > 0 ? 0 : 1, sigma};
+      if (!(sigma > 0))
+        v += {1, 0, sigma};
+      else if (S.flat && isFlat(S, S.elements[i]))
+        v += {0, 1, 0};
+      else
+        v += {0, 0, sigma};
     }
     return v;
   };
@@ -1722,15 +1743,6 @@ struct Functional {
 /// to 0 there; with 1/8 the cube turned by 3 rad stays tangled.
 constexpr double volumeWeight = 1;
 
-Mat3 jacobianOf(const Smoother& S, int E) {
-  const std::array<int, 4>& tet = S.M.tets[E];
-  const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
-  const Vec3 x = S.M.x[tet[0]];
-  Mat3 J{};
-  for (int k = 1; k < 4; ++k) J = J + outer(S.M.x[tet[k]] - x, g[k]);
-  return J;
-}
-
 /// Σ η + (1 + σ²)/(2h) over the mesh, with its gradient at the free inner nodes, σ_min, and the
 /// diagonal of the Hessian's part 2 η |g|²/N.
 ///   source  Garanzha et al., Foldover-free maps in 50 lines of code
@@ -1902,13 +1914,12 @@ constexpr double hopelessPart = .1;
 /// [choice] Most meshes are valid after so many; then the nodes of sheets keep apart.
 constexpr int easySweeps = 10;
 
-/// [choice] For so many sweeps elements whose volume is as small as this beside the cube of their
-/// edges count as inverted: where rounding alone makes them valid, a node's way out of them is
-/// shorter than the last digit of its coordinates, and no sweep without δ changes them. (Inner
-/// nodes moved to the end of what is valid: 148 of 372 kept elements with q below .05, now none
-/// does.)
+/// [choice] For so many sweeps elements that are as good as flat count as inverted: where rounding
+/// alone makes them valid, a node's way out of them is shorter than the last digit of its
+/// coordinates, and no sweep without δ changes them. (Inner nodes moved to the end of what is
+/// valid: 148 of 372 kept elements with q below .05, now none does.) Not with a δ of each star,
+/// which is 0 there all the same.
 constexpr int flatSweeps = 20;
-constexpr double nearlyFlat = 1e-7;
 
 /// μ of the sweep: the next rung where the number of inverted elements does not fall.
 struct MuSchedule {
@@ -1933,26 +1944,35 @@ struct MuSchedule {
 void wakeInverted(Smoother& S) {
   S.crew.forPieces(0, static_cast<int>(S.elements.size()), piece, [&](int, int from, int to) {
     for (int i = from; i < to; ++i)
-      if (!(sigmaOf(S, S.elements[i]) > 0))
+      if (!(sigmaOf(S, S.elements[i]) > 0) || (S.flat && isFlat(S, S.elements[i])))
         for (int n : S.M.tets[S.elements[i]]) wakeNode(S, n);
   });
 }
 
+/// The nodes' places, and those of sliding ones on their surfaces and curves.
+struct Positions {
+  std::vector<Vec3> x;
+  std::vector<Vec2> parameter;
+};
+
 /// [§3.7.4, Algorithm 2] optimizeMesh's loop. While elements are inverted δ comes from the σ_min of
 /// all elements that may change and holds for all nodes; afterwards it is 0, and a move that would
-/// invert an element has f = ∞. Returns whether it converged on a valid mesh.
-bool untangleAndSmooth(Smoother& S) {
+/// invert an element has f = ∞. Keeps the last places where a mesh with a δ, for elements that are
+/// as good as flat, is valid. Returns whether it converged on a valid mesh.
+bool sweepUntilSettled(Smoother& S, Positions& lastValid) {
   MuSchedule schedule;
   bool tangled = true;
   const double settled = S.options.power > 1 ? settledFraction * S.options.maxDisp : 0;
   const double wake = std::max(wakeFraction * S.options.maxDisp, settled);
   const OptimizeOptions& o = S.options;
   const bool wakesLess = o.acceleration > 0 && o.active.empty() && !o.starDelta;
+  const int flatUntil = o.starDelta ? 0 : std::min(flatSweeps, o.maxTangledSweeps);
   Anderson acceleration(S);
   while (sweepsLeft(S)) {
-    S.flat = tangled && schedule.tangledSweeps < flatSweeps ? nearlyFlat : 0;
-    const Validity v = tangled ? validity(S) : Validity{0, 1};
-    tangled = v.inverted > 0;
+    S.flat = tangled && S.report.sweeps < flatUntil;
+    const Validity v = tangled ? validity(S) : Validity{0, 0, 1};
+    tangled = v.inverted + v.flat > 0;
+    if (tangled && v.inverted == 0) lastValid = {S.M.x, S.M.parameter};
     if (tangled && !S.options.globalDescent && schedule.isHopeless(v.inverted)) return false;
     if (tangled && schedule.tangledSweeps >= S.options.maxTangledSweeps) {
       if (!S.options.globalDescent) return false;
@@ -1965,7 +1985,8 @@ bool untangleAndSmooth(Smoother& S) {
     if (wakesLess && S.tangled && !tangled)
       for (int n : S.order) wakeNode(S, n);
     S.wake = tangled && wakesLess ? tangledWake : wake;
-    S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted)) : 0;
+    S.delta =
+        tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted + v.flat)) : 0;
     S.tangled = tangled;
     S.stuck = tangled && schedule.tangledSweeps > easySweeps;
     S.rung = schedule.rung;
@@ -1978,6 +1999,15 @@ bool untangleAndSmooth(Smoother& S) {
     if (accelerated && acceleration.meanDisp() <= settled) return true;
   }
   return false;
+}
+
+/// The loop; a mesh that was valid stays so, also where it ends before flat elements are cured.
+bool untangleAndSmooth(Smoother& S) {
+  Positions lastValid;
+  const bool converged = sweepUntilSettled(S, lastValid);
+  if (!converged && !lastValid.x.empty() && validity(S).inverted > 0)
+    S.M.x = lastValid.x, S.M.parameter = lastValid.parameter;
+  return converged;
 }
 
 // ---- the worst elements ------------------------------------------------------------------------

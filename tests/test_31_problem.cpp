@@ -307,20 +307,25 @@ TEST_SUITE("3.2") {
   }
 
   TEST_CASE("the nearer one of two needles") {  // of whose normals few digits are right
-    const std::vector<Vec3> random = scatteredPoints(600);
-    for (double width : {1e-3, 1e-8, 1e-10, 1e-12})
-      for (size_t i = 0; i < random.size(); i += 3) {
-        const Vec3 a = random[i], along = random[i + 1], across = width * random[i + 2];
-        const Vec3 n = cross(along, random[i + 2]), up = (.1 / norm(n)) * n;
-        const Vec3 x = a + .7 * along + .3 * across + up;  // .1 above the first
-        std::vector<Vec3> points{a, a + along, a + .6 * along + across};
-        for (int k = 0; k < 3; ++k) points.push_back(points[k] + (2 + 1e-8) * up);
-        for (const std::array<int, 3>& first : {std::array<int, 3>{0, 1, 2}, {3, 4, 5}}) {
-          const TriangleTree tree(points, {first, {3 - first[0], 4 - first[0], 5 - first[0]}});
-          const ClosestPoint p = closestPointOnTriangle(x, points[0], points[1], points[2]);
-          CHECK(tree.closest(x).distance == p.distance);
-        }
-      }
+    const std::vector<Vec3> random = scatteredPoints(300);
+    for (double width : {1e-3, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12})
+      for (double height : {.1, 10 * width, width, .1 * width})
+        for (double gap : {1e-2, 1e-3, 1e-8})
+          for (std::size_t i = 0; i < random.size(); i += 3) {
+            const Vec3 a = random[i], along = random[i + 1], across = width * random[i + 2];
+            const Vec3 n = cross(along, random[i + 2]), up = (height / norm(n)) * n;
+            const Vec3 x = a + .7 * along + .3 * across + up;  // above the first one
+            std::vector<Vec3> points{a, a + along, a + .6 * along + across};
+            for (int k = 0; k < 3; ++k) points.push_back(points[k] + (2 + gap) * up);
+            const int first = static_cast<int>(i) % 2 * 3, turn = static_cast<int>(i / 3) % 3;
+            const TriangleTree tree(points,
+                                    {{first + turn, first + (turn + 1) % 3, first + (turn + 2) % 3},
+                                     {3 - first, 4 - first, 5 - first}});
+            double least = 1e9;
+            for (const std::array<Vec3, 3>& c : tree.corners)
+              least = std::min(least, closestPointOnTriangle(x, c[0], c[1], c[2]).distance);
+            CHECK(tree.closest(x).distance == least);
+          }
   }
 
   TEST_CASE("the nearest point of a triangle is that of a search, for needles too") {

@@ -45,6 +45,23 @@ Mesh shakenCube(int n, double amount) {
   return M;
 }
 
+/// A cube of 4x4x4 with the node at this place fixed as far out of it as no element is inverted:
+/// some are as good as flat.
+Mesh cubeWithFlatElements(Vec3 place, std::vector<int>& fixed) {
+  Mesh M = shakenCube(4, 0);
+  for (std::size_t n = 0; n < M.x.size(); ++n)
+    if (norm(M.x[n] - place) < 1e-9) fixed = {static_cast<int>(n)};
+  const Vec3 out{.3, .5, .81};
+  double valid = 0, inverted = 1;
+  for (int halving = 0; halving < 60; ++halving) {
+    const double middle = .5 * (valid + inverted);
+    M.x[fixed.at(0)] = place + middle * out;
+    (shapes::countInverted(M) > 0 ? inverted : valid) = middle;
+  }
+  M.x[fixed[0]] = place + valid * out;
+  return M;
+}
+
 /// An inner block of a Kuhn cube turned about a skew axis; the block's nodes are to be fixed.
 Mesh turnedCube(int n, int lo, int hi, double angle, std::vector<int>& block) {
   Mesh M = shakenCube(n, 0);
@@ -241,26 +258,59 @@ TEST_SUITE("3.7.4") {
   }
 
   TEST_CASE("Algorithm 2: choice, elements that are as good as flat are untangled") {
-    // a fixed node as far out of its place as no element is inverted: some are as good as flat
-    const Vec3 places[] = {{.25, .75, .5}, {.5, .75, .25}, {.75, .5, .5}}, out{.3, .5, .81};
+    const Vec3 places[] = {{.25, .75, .5}, {.5, .75, .25}, {.75, .5, .5}};
     for (const Vec3& place : places) {
       CAPTURE(place.x);
       OptimizeOptions options;
-      Mesh M = shakenCube(4, 0);
-      for (std::size_t n = 0; n < M.x.size(); ++n)
-        if (norm(M.x[n] - place) < 1e-9) options.fixed.push_back(static_cast<int>(n));
-      Vec3& x = M.x[options.fixed.at(0)];
-      double valid = 0, inverted = 1;
-      for (int halving = 0; halving < 60; ++halving) {
-        const double middle = .5 * (valid + inverted);
-        x = place + middle * out;
-        (shapes::countInverted(M) > 0 ? inverted : valid) = middle;
-      }
-      x = place + valid * out;
+      Mesh M = cubeWithFlatElements(place, options.fixed);
       REQUIRE(shapes::countInverted(M) == 0);
       REQUIRE(qualityStatistics(M).min < 1e-8);
       CHECK(optimizeMesh(M, options).minQ > .3);
     }
+  }
+
+  TEST_CASE(
+      "Algorithm 2: a valid mesh stays valid where the sweeps end before flat ones are cured") {
+    for (int sweeps : {1, 2, 5, 10}) {
+      Mesh M = shakenCube(6, .25);
+      for (Vec3& x : M.x) x.z *= 1e-4;  // sheared strongly as seen from the ideal elements
+      for (Vec3& xi : M.xi) xi.z *= 1e-4;
+      REQUIRE(shapes::countInverted(M) == 0);
+      REQUIRE(qualityStatistics(M).min < 1e-5);
+      OptimizeOptions options;
+      options.maxSweeps = sweeps;
+      int inverted = 0;
+      options.onSweep = [&](const Sweep& sweep) { inverted = sweep.inverted; };
+      CHECK(optimizeMesh(M, options).inverted == 0);
+      CHECK(inverted > 0);  // of the sweeps' end, which is not kept
+    }
+  }
+
+  TEST_CASE("Algorithm 2: choice, flat elements without a free node do not hold up the others") {
+    for (bool globalDescent : {true, false}) {
+      OptimizeOptions options;
+      Mesh M = cubeWithFlatElements({.25, .75, .5}, options.fixed);
+      for (std::size_t E = 0; E < M.tets.size(); ++E)
+        if (qualities(M)[E] < 1e-4)
+          options.fixed.insert(options.fixed.end(), M.tets[E].begin(), M.tets[E].end());
+      options.maxTangledSweeps = 12, options.globalDescent = globalDescent;
+      const OptimizeReport report = optimizeMesh(M, options);
+      CHECK(report.converged);
+      CHECK(report.sweeps < 60);
+    }
+  }
+
+  TEST_CASE("Algorithm 2: choice, elements whose ideal ones are as thin are not flat") {
+    const auto sweepsOf = [](double thickness) {
+      Mesh M = shakenCube(6, 0);
+      const Mesh shaken = shakenCube(6, .25);
+      for (std::size_t n = 0; n < M.x.size(); ++n) M.x[n].z = thickness * shaken.x[n].z;
+      for (Vec3& xi : M.xi) xi.z *= thickness;
+      const OptimizeReport report = optimizeMesh(M);
+      CHECK(report.minQ > .999);
+      return report.sweeps;
+    };
+    CHECK(sweepsOf(1e-8) <= sweepsOf(1e-3) + 2);
   }
 
   TEST_CASE("Algorithm 2: departure, while a mesh is tangled what moves little is not visited") {
