@@ -4564,17 +4564,16 @@ template <class Wanted>
 void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, const Crew& crew,
                Wanted wanted) {
   constexpr int maxPasses = 250;  // one level a pass; levels fit in a byte
-  std::vector<int> changed(B.M.tets.size());
-  std::iota(changed.begin(), changed.end(), 0);
   for (int pass = 0; pass < maxPasses; ++pass) {
-    cut.resize(B.M.tets.size());
-    crew.forPieces(0, static_cast<int>(changed.size()), queryPiece, [&](int, int from, int to) {
+    std::vector<int> unknown;
+    for (std::size_t E = 0; E < cut.size(); ++E)
+      if (cut[E].is == Cut::unknown) unknown.push_back(static_cast<int>(E));
+    crew.forPieces(0, static_cast<int>(unknown.size()), queryPiece, [&](int, int from, int to) {
       for (int i = from; i < to; ++i)
-        if (Cut& known = cut[changed[i]]; known.is == Cut::unknown)
-          known = cutBySurface(B.M, changed[i], S, known.triangle);
+        cut[unknown[i]] = cutBySurface(B.M, unknown[i], S, cut[unknown[i]].triangle);
     });
     std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
-    for (int E : changed)
+    for (int E = 0; E < static_cast<int>(cut.size()); ++E)
       if (cut[E].is == Cut::yes && wanted(E)) refine.push_back({E, B.M.level[E]});
     if (refine.empty()) return;
     B.splits.clear();
@@ -4588,9 +4587,6 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, co
       const Cut part = isPart && whole.is == Cut::no ? whole : Cut{Cut::unknown, whole.triangle};
       cut[split.parent] = cut[split.child] = part;
     }
-    changed.clear();
-    for (std::size_t E = 0; E < cut.size(); ++E)
-      if (cut[E].is == Cut::unknown) changed.push_back(static_cast<int>(E));
   }
 }
 
@@ -5830,15 +5826,12 @@ Extraction extractSurface(const Mesh& M, const SquareSurface& Q, const SurfaceDi
     if (outline == Outline::halfSquares) rim.run(true);
   }
   const TriangleTree tree = treeOf(M, Q, result.selected);
-  const std::string noDisk = diskFault(Q, result.selected);
-  const std::string blocked = blockedPlace(Q, S, survey, side, tree);
-  const std::string missing = leftOut(tree, Q.h, S);
-  result.isBlocked = !blocked.empty();
-  if (result.isBlocked)
-    result.fault = "another surface is nearer to S than its squares, near " + blocked;
-  else if (!noDisk.empty())
+  if (const std::string place = blockedPlace(Q, S, survey, side, tree); !place.empty()) {
+    result.isBlocked = true;
+    result.fault = "another surface is nearer to S than its squares, near " + place;
+  } else if (const std::string noDisk = diskFault(Q, result.selected); !noDisk.empty())
     result.fault = "S_M is no disk, " + noDisk;
-  else if (!missing.empty())
+  else if (const std::string missing = leftOut(tree, Q.h, S); !missing.empty())
     result.fault = "S_M leaves out the part of S near " + missing;
   else
     result.energy = rim.energy() + uncovered(tree, Q.h, S);
@@ -7232,7 +7225,7 @@ Vec3 firstInverted(const Mesh& M) {
 }
 
 /// [choice] From so many elements on a way takes the refined mesh for itself instead of a copy, a
-/// fifth of all memory; most meshes of this size need but one way.
+/// fifth of all memory; a second way refines anew.
 constexpr std::size_t tooLargeToCopy = 200000;
 
 /// §3.4's labels and 3.5 on the refined mesh. Returns the rounds of healing.

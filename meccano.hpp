@@ -822,7 +822,7 @@ using Selection = std::vector<unsigned char>;
 struct Extraction {
   Selection selected;
   double energy = 0;       // what sides are ranked by: rim energy and interior coverage
-  std::string fault;       // why it cannot be used; empty: it is a disk near all of S
+  std::string fault;       // no disk, in another surface's way, or far from a part of S
   bool isBlocked = false;  // because another surface is in the way
 };
 /// [§3.4] The squares with all nodes on this side (±1) of S (of a middleApproximation(), side 0:
@@ -855,7 +855,10 @@ class SurfaceComplex {
   /// Follows the mesh after the bisections of B.splits[firstSplit], ...
   void update(const Bisection& B, std::size_t firstSplit);
   bool isEdge(int a, int b) const { return node[a] && node[b] && edgeBetween(a, b) >= 0; }
-  bool isRimEdge(int a, int b) const { return isEdge(a, b) && edges[edgeBetween(a, b)].faces == 1; }
+  bool isRimEdge(int a, int b) const {
+    const int at = edgeBetween(a, b);
+    return at >= 0 && edges[at].faces == 1;
+  }
 
   const int surface;          // its number k
   std::vector<int> elements;  // with a node on S_M, at least
@@ -1058,7 +1061,8 @@ QualityStatistics qualityStatistics(const std::vector<double>& q);
 /// q of each tetrahedron. [tets]
 std::vector<double> qualities(const Mesh& M, Ideal ideal = Ideal::computational);
 /// The same where M was made by bisection and moves of a mesh with the nodes `before`, whose q are
-/// given: computed anew for tetrahedra with new or moved nodes only, as each part of another has.
+/// given: computed anew for tetrahedra with new or moved nodes only. (Each part of a bisected one
+/// has a new node.)
 std::vector<double> qualities(const Mesh& M, const std::vector<Vec3>& before,
                               std::vector<double> q);
 
