@@ -7320,6 +7320,11 @@ constexpr double badHausdorff = .45;  // [choice] of l_c: refused
 /// more.
 constexpr double betterBy = .01;
 
+/// What the lowest q of a way counts.
+double countedQuality(double lowest, const InsertReport& report) {
+  return report.hausdorff > poorHausdorff * report.lc ? poorWorth * lowest : lowest;
+}
+
 /// Refuses S_M where it is far from S, and warns where it is poor.
 void judgeSurface(double h, InsertReport& report) {
   constexpr double poorShift = 2;  // [choice] of h: warned of
@@ -7416,7 +7421,9 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
                number(after.smoothed.min));
     const bool enough = report.hausdorff <= badHausdorff * lc;  // then q may not fall for it
     if (after.hausdorff >= report.hausdorff) return;
-    if (enough && after.smoothed.min < report.smoothed.min - betterBy) return;
+    if (enough && countedQuality(after.smoothed.min, after) <
+                      countedQuality(report.smoothed.min, report) - betterBy)
+      return;
     after.optimization.sweeps += report.optimization.sweeps;
     after.optimization.visits += report.optimization.visits;
     M = std::move(trial), report = after;
@@ -7446,8 +7453,8 @@ bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
     return true;
   }
   // beside earlier surfaces the lowest q may be theirs, on every way
-  double lowest = I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min;
-  if (ofThisWay.hausdorff > poorHausdorff * lc) lowest *= poorWorth;
+  const double lowest =
+      countedQuality(I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min, ofThisWay);
   const double worth = lowest + ofThisWay.smoothed.mean;
   if (report.surface == 0 || worth > I.worth + betterBy)
     report = ofThisWay, result = std::move(trial), I.lowest = lowest, I.worth = worth;
