@@ -28,6 +28,19 @@ std::string number(double value) {
   return text;
 }
 
+void growBox(TriangleTree::Box& box, Vec3 p) {
+  box.lo = {std::min(box.lo.x, p.x), std::min(box.lo.y, p.y), std::min(box.lo.z, p.z)};
+  box.hi = {std::max(box.hi.x, p.x), std::max(box.hi.y, p.y), std::max(box.hi.z, p.z)};
+}
+
+/// The numbers of what is marked, ascending.
+std::vector<int> markedOf(const std::vector<char>& mark) {
+  std::vector<int> marked;
+  for (std::size_t i = 0; i < mark.size(); ++i)
+    if (mark[i]) marked.push_back(static_cast<int>(i));
+  return marked;
+}
+
 /// Open-addressing hash from 64-bit keys (lattice points, node pairs) to an int, 0 where absent.
 class KeyMap {
  public:
@@ -836,13 +849,9 @@ void appendDissection(const std::vector<Vec3>& points, const SparseMatrix& lambd
     order.insert(order.end(), part.begin(), part.end());
     return;
   }
-  Vec3 lo = points[part[0]], hi = lo;
-  for (int n : part) {
-    const Vec3 p = points[n];
-    lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
-    hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
-  }
-  const Vec3 l = hi - lo;
+  TriangleTree::Box box{points[part[0]], points[part[0]]};
+  for (int n : part) growBox(box, points[n]);
+  const Vec3 l = box.hi - box.lo;
   const int axis = l.x >= l.y && l.x >= l.z ? 0 : l.y >= l.z ? 1 : 2;
   const auto middle = part.begin() + part.size() / 2;
   std::nth_element(part.begin(), middle, part.end(), [&](int a, int b) {
@@ -1419,26 +1428,18 @@ void straightenChain(const MeccanoSurface& B, CutSolid& D, int c) {
   tracePaths(B, D, {c});
 }
 
-}  // namespace
-
-namespace {
-
 /// Directions that the meccano's axes take in space, with the solid's extents along them.
 struct Frame {
   std::array<Vec3, 3> axis;
-  Vec3 lo, hi;
+  TriangleTree::Box box;
   Vec3 coordinates(Vec3 x) const { return {dot(axis[0], x), dot(axis[1], x), dot(axis[2], x)}; }
-  Vec3 size() const { return hi - lo; }
+  Vec3 size() const { return box.hi - box.lo; }
 };
 
 Frame frameAlong(const std::array<Vec3, 3>& axis, const TriangleSurface& D) {
-  Frame F{axis, {}, {}};
-  F.lo = F.hi = F.coordinates(D.points[0]);
-  for (const Vec3& p : D.points) {
-    const Vec3 c = F.coordinates(p);
-    F.lo = {std::min(F.lo.x, c.x), std::min(F.lo.y, c.y), std::min(F.lo.z, c.z)};
-    F.hi = {std::max(F.hi.x, c.x), std::max(F.hi.y, c.y), std::max(F.hi.z, c.z)};
-  }
+  Frame F{axis, {}};
+  F.box.lo = F.box.hi = F.coordinates(D.points[0]);
+  for (const Vec3& p : D.points) growBox(F.box, F.coordinates(p));
   return F;
 }
 
@@ -1569,7 +1570,7 @@ void placeCorners(const MeccanoSurface& B, const Frame& F, Start start, CutSolid
     if (!B.isCorner[n]) continue;
     double f[3];  // place in the box, from -1 to 1
     for (int a = 0; a < 3; ++a) f[a] = 2. * (B.nodes[n][a] - lo[a]) / (hi[a] - lo[a]) - 1;
-    const Vec3 size = F.size(), middle = .5 * (F.lo + F.hi);
+    const Vec3 size = F.size(), middle = .5 * (F.box.lo + F.box.hi);
     const Vec3 target = middle + .5 * shrink * Vec3{f[0] * size.x, f[1] * size.y, f[2] * size.z};
     D.node[n] = cheapestPoint(D, [&](Vec3 x) {
       const Vec3 c = F.coordinates(x);
@@ -2472,17 +2473,25 @@ void Bisection::bisectEdge(int a, int b) {
                     std::to_string(b) + " is not split; the mesh is no bisection of Kuhn cubes");
 }
 
+namespace {
+
+/// Bisects these tetrahedra, each once: not one that the closure of another has bisected.
+void bisectOnce(Bisection& B, const std::vector<int>& E) {
+  std::vector<unsigned char> level;
+  for (int t : E) level.push_back(B.M.level[t]);
+  for (std::size_t i = 0; i < E.size(); ++i)
+    if (B.M.level[E[i]] == level[i]) B.bisect(E[i]);
+}
+
+}  // namespace
+
 void bisect(Mesh& M, const std::vector<int>& E) {
   checkMeccano(M, "bisect (§3.2)");
-  Bisection B(M);
-  std::vector<int> level;
-  for (int t : E) {
+  for (int t : E)
     if (t < 0 || t >= static_cast<int>(M.tets.size()))
       throw InputError("bisect (§3.2): there is no tetrahedron " + std::to_string(t));
-    level.push_back(M.level[t]);
-  }
-  for (std::size_t i = 0; i < E.size(); ++i)
-    if (M.level[E[i]] == level[i]) B.bisect(E[i]);
+  Bisection B(M);
+  bisectOnce(B, E);
 }
 
 // ==== 2. Terrain =================================================================================
@@ -2774,16 +2783,15 @@ CurvedBoundary curvedBoundary(const Mesh& M) {
   return B;
 }
 
-/// Calls sample(w0, w1, w2) on a lattice of the triangle without its vertices, until it is true.
+/// Calls sample(w0, w1, w2) on a lattice of the triangle without its vertices.
 template <class Sample>
-bool anySample(int steps, Sample sample) {
+void forSamples(int steps, Sample sample) {
   for (int a = 0; a <= steps; ++a)
     for (int b = 0; a + b <= steps; ++b) {
       const int c = steps - a - b;
       if (a == steps || b == steps || c == steps) continue;
-      if (sample(double(a) / steps, double(b) / steps, double(c) / steps)) return true;
+      sample(double(a) / steps, double(b) / steps, double(c) / steps);
     }
-  return false;
 }
 
 /// A point of Π and the point of the flat face with the same barycentric coordinates.
@@ -2813,16 +2821,15 @@ void sampleFace(const Mesh& M, const BoundaryFace& face, const CurvedBoundary& O
                 int steps, FaceDistance& d) {
   const std::array<Vec3, 3> x = placesOf(M, face.n);
   const Parametrization& P = surfaceOf(M, face.label);
-  anySample(steps, [&](double a, double b, double c) {
+  forSamples(steps, [&](double a, double b, double c) {
     const Sampled at = sampled(P, x, face.u, a, b, c);
     const double bound = norm(at.onSolid - at.onFace);
     if (bound <= std::max(enough, std::min(d.toSolid, d.toFace))) {
       d.toSolid = std::max(d.toSolid, bound), d.toFace = std::max(d.toFace, bound);
-      return false;
+      return;
     }
     d.toSolid = std::max(d.toSolid, Omega.tree.closest(at.onFace, bound * (1 + 1e-9)).distance);
     d.toFace = std::max(d.toFace, closestPointOnTriangle(at.onSolid, x[0], x[1], x[2]).distance);
-    return false;
   });
 }
 
@@ -2957,10 +2964,9 @@ TriangleList getTrianglesToRefine(const Mesh& M, const BoundaryDistance& d, doub
 
 TriangleList refineTriangles(Bisection& B, const TriangleList& tau) {
   const int nodes = static_cast<int>(B.M.x.size());
-  std::vector<unsigned char> level;
-  for (const BoundaryTriangle& t : tau) level.push_back(B.M.level[t.E]);
-  for (std::size_t k = 0; k < tau.size(); ++k)
-    if (B.M.level[tau[k].E] == level[k]) B.bisect(tau[k].E);
+  std::vector<int> refine;
+  for (const BoundaryTriangle& t : tau) refine.push_back(t.E);
+  bisectOnce(B, refine);
   TriangleList tauNew;
   for (int E = 0; E < static_cast<int>(B.M.tets.size()); ++E)
     for (int i = 0; i < 4; ++i) {
@@ -2992,10 +2998,7 @@ std::vector<int> boundaryNodes(const Mesh& M) {
     for (int i = 0; i < 4; ++i)
       if (M.faceLabel[E][i] < 0)
         for (int j = 1; j < 4; ++j) on[M.tets[E][(i + j) % 4]] = 1;
-  std::vector<int> nodes;
-  for (int n = 0; n < static_cast<int>(on.size()); ++n)
-    if (on[n]) nodes.push_back(n);
-  return nodes;
+  return markedOf(on);
 }
 
 /// [departure] A tetrahedron with two faces on ∂M flattens where Π makes its patch edge smooth, and
@@ -3153,12 +3156,11 @@ double movedFaceDistance(const Mesh& M, const BoundaryFace& face, double enough)
   const std::array<Vec3, 3> x = placesOf(M, face.n);
   const Parametrization& P = surfaceOf(M, face.label);
   double most = 0;
-  anySample(steps, [&](double a, double b, double c) {
+  forSamples(steps, [&](double a, double b, double c) {
     const Sampled at = sampled(P, x, face.u, a, b, c);
     double d = norm(at.onSolid - at.onFace);
     if (d > enough) d = closestPointOnTriangle(at.onSolid, x[0], x[1], x[2]).distance;
     most = std::max(most, d);
-    return false;
   });
   return most;
 }
@@ -3322,15 +3324,12 @@ int bisectStuck(Mesher& W, double lowest) {
 }
 
 /// Nodes of the tetrahedra at nodes from `first` on: where a refinement has been.
-std::vector<int> nodesNear(const Mesh& M, std::size_t first) {
+std::vector<int> nodesNearNew(const Mesh& M, std::size_t first) {
   std::vector<char> near(M.x.size(), 0);
   for (const std::array<int, 4>& z : M.tets)
     if (std::size_t(*std::max_element(z.begin(), z.end())) >= first)
       for (int n : z) near[n] = 1;
-  std::vector<int> nodes;
-  for (int n = 0; n < static_cast<int>(near.size()); ++n)
-    if (near[n]) nodes.push_back(n);
-  return nodes;
+  return markedOf(near);
 }
 
 /// The valid mesh within eps of highest lowest quality so far; before the last rounds any.
@@ -3390,7 +3389,7 @@ void optimizeQuality(Mesher& W, const Mesh& initial) {
     if (inverted > fewTangled) break;
     best.keep(W, distanceTo(W.M, W.Omega, eps).largest(), eps, round + 1, false);
     if (last) slide = stuck == 0 && inverted == 0 ? Slide::again : Slide::atLast;
-    active = slide == Slide::again ? nodesNear(W.M, nodes) : std::vector<int>{};
+    active = slide == Slide::again ? nodesNearNew(W.M, nodes) : std::vector<int>{};
   }
   if (best.lowest < 0)
     throw MethodError("meccanoMesher (§2): no mesh is valid and within eps = " +
@@ -3883,11 +3882,6 @@ double boxDistance2(const TriangleTree::Box& a, const TriangleTree::Box& b) {
   return norm2(Vec3{std::max(std::max(after.x, before.x), 0.),
                     std::max(std::max(after.y, before.y), 0.),
                     std::max(std::max(after.z, before.z), 0.)});
-}
-
-void growBox(TriangleTree::Box& box, Vec3 p) {
-  box.lo = {std::min(box.lo.x, p.x), std::min(box.lo.y, p.y), std::min(box.lo.z, p.z)};
-  box.hi = {std::max(box.hi.x, p.x), std::max(box.hi.y, p.y), std::max(box.hi.z, p.z)};
 }
 
 /// A triangle's number and the centre of its box.
@@ -4542,17 +4536,14 @@ std::vector<Cut> cutsBeforeSearch(const Mesh& M, const SurfaceDistance& S) {
 Cut cutBySurface(const Mesh& M, int E, const SurfaceDistance& S, int known) {
   std::array<Vec3, 4> tet;
   for (int i = 0; i < 4; ++i) tet[i] = M.x[M.tets[E][i]];
-  Vec3 lo = tet[0], hi = tet[0];
-  for (const Vec3& p : tet) {
-    lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
-    hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
-  }
-  const Vec3 margin = 1e-9 * (hi - lo);
-  if (!boxesMeet(S.tree.nodes[0].box, lo - margin, hi + margin)) return {Cut::no};
+  TriangleTree::Box box{tet[0], tet[0]};
+  for (const Vec3& p : tet) growBox(box, p);
+  const Vec3 margin = 1e-9 * (box.hi - box.lo), lo = box.lo - margin, hi = box.hi + margin;
+  if (!boxesMeet(S.tree.nodes[0].box, lo, hi)) return {Cut::no};
   const FacePlanes planes(tet);
   if (known >= 0 && meets(planes, cornersOf(S.S, known))) return {Cut::yes, known};
   Cut cut{Cut::no};
-  S.tree.visit(lo - margin, hi + margin, [&](int t) {
+  S.tree.visit(lo, hi, [&](int t) {
     if (meets(planes, cornersOf(S.S, t))) cut = {Cut::yes, t};
     return cut.is == Cut::yes;
   });
@@ -4572,13 +4563,12 @@ void refineCut(Bisection& B, const SurfaceDistance& S, std::vector<Cut>& cut, co
       for (int i = from; i < to; ++i)
         cut[unknown[i]] = cutBySurface(B.M, unknown[i], S, cut[unknown[i]].triangle);
     });
-    std::vector<std::pair<int, int>> refine;  // tetrahedron, its level
+    std::vector<int> refine;
     for (int E = 0; E < static_cast<int>(cut.size()); ++E)
-      if (cut[E].is == Cut::yes && wanted(E)) refine.push_back({E, B.M.level[E]});
+      if (cut[E].is == Cut::yes && wanted(E)) refine.push_back(E);
     if (refine.empty()) return;
     B.splits.clear();
-    for (const auto& [E, level] : refine)
-      if (B.M.level[E] == level) B.bisect(E);
+    bisectOnce(B, refine);
     cut.resize(B.M.tets.size());
     // what is not cut has no parts that are, but where a midpoint was moved onto a surface
     for (const Bisection::Split& split : B.splits) {
@@ -4795,20 +4785,13 @@ void completeCubes(Bisection& B, Approximation& A, std::vector<int> queue) {
     }
 }
 
-std::vector<int> elementsOf(const std::vector<char>& T) {
-  std::vector<int> elements;
-  for (std::size_t E = 0; E < T.size(); ++E)
-    if (T[E]) elements.push_back(static_cast<int>(E));
-  return elements;
-}
-
 constexpr int tetsPerCube = 6;  // at least
 
 /// For each lattice node of T the cubes of T around it: bit 1 x+, bit 2 y+, bit 4 z+ of the cube's
 /// place.
 KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint64_t>& nodes) {
   const Lattice lattice(A.level);
-  const std::vector<int> elements = elementsOf(A.T);
+  const std::vector<int> elements = markedOf(A.T);
   KeyMap cubes(elements.size() / tetsPerCube), at(elements.size() / 3);
   for (int E : elements) {
     const std::uint64_t key = lattice.cubeOf(M, E);
@@ -4829,7 +4812,7 @@ KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint
 /// The lattice nodes of 𝓣: place → 1 + mesh node.
 KeyMap nodesOf(const Mesh& M, const Approximation& A) {
   const Lattice lattice(A.level);
-  const std::vector<int> elements = elementsOf(A.T);
+  const std::vector<int> elements = markedOf(A.T);
   KeyMap meshNode(elements.size() / 3);
   for (int E : elements)
     for (int n : M.tets[E])
@@ -4866,7 +4849,7 @@ void volumetricHealing(Bisection& B, Approximation& A) {
   constexpr int maxRounds = 200;
   std::array<bool, 256> isDisk;
   for (unsigned mask = 0; mask < isDisk.size(); ++mask) isDisk[mask] = isLocalDisk(mask);
-  completeCubes(B, A, elementsOf(A.T));
+  completeCubes(B, A, markedOf(A.T));
   for (int round = 0; round < maxRounds; ++round) {
     std::vector<std::uint64_t> keys;
     const KeyMap cubes = cubesAtNodes(B.M, A, keys);
@@ -4900,7 +4883,7 @@ struct Cubes {
 
   Cubes(const Mesh& M, const Approximation& A) {
     const Lattice lattice(A.level);
-    const std::vector<int> ofT = elementsOf(A.T);
+    const std::vector<int> ofT = markedOf(A.T);
     number = KeyMap(ofT.size() / tetsPerCube);
     for (int E : ofT) {
       const std::array<int, 4>& z = M.tets[E];
@@ -4950,7 +4933,7 @@ Cubes cubesAround(const Mesh& M, const Approximation& A) {
   const Lattice lattice(A.level);
   Cubes cubes(M, A);
   std::vector<char> touches(M.x.size(), 0);  // the nodes around which all cubes are taken
-  for (int E : elementsOf(A.T))
+  for (int E : markedOf(A.T))
     for (int n : M.tets[E])
       if (lattice.isNode(M.xi[n])) touches[n] = !isOnBoundary(M, n);
   for (std::size_t E = 0; E < M.tets.size(); ++E)
@@ -5053,13 +5036,13 @@ CubeGraph graphOf(const Mesh& M, const Cubes& cubes, int level, const SurfaceDis
   return G;
 }
 
-/// Whether the element has this point of the computational space; exact, all numbers are dyadic.
-bool holds(const Mesh& M, int E, Vec3 xi) {
-  const std::array<int, 4>& z = M.tets[E];
+/// Whether the element with these nodes has the point p; exact where all numbers are dyadic, as in
+/// the computational space.
+bool holds(const std::vector<Vec3>& x, const std::array<int, 4>& z, Vec3 p) {
   for (int i = 0; i < 4; ++i) {
     const std::array<int, 3> v = faceOpposite(z, i);
-    const Vec3 normal = cross(M.xi[v[1]] - M.xi[v[0]], M.xi[v[2]] - M.xi[v[0]]);
-    if (dot(normal, xi - M.xi[v[0]]) * dot(normal, M.xi[z[i]] - M.xi[v[0]]) < 0) return false;
+    const Vec3 normal = cross(x[v[1]] - x[v[0]], x[v[2]] - x[v[0]]);
+    if (dot(normal, p - x[v[0]]) * dot(normal, x[z[i]] - x[v[0]]) < 0) return false;
   }
   return true;
 }
@@ -5073,7 +5056,7 @@ void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
     coarse = false;
     B.star(node, around);
     for (std::size_t i = 0; i < around.size() && !coarse; ++i)
-      if (B.M.level[around[i]] < level && holds(B.M, around[i], centre))
+      if (B.M.level[around[i]] < level && holds(B.M.xi, B.M.tets[around[i]], centre))
         B.bisect(around[i]), coarse = true;
   }
 }
@@ -5107,7 +5090,7 @@ DividedCubes divideCubes(const Mesh& M, const Approximation& A, const SurfaceDis
 /// faces are off their surface, which S may be nearer to.
 void refineSurfacesAround(Bisection& B, Approximation& A) {
   std::vector<char> isOfT(B.M.x.size(), 0);
-  for (int E : elementsOf(A.T))
+  for (int E : markedOf(A.T))
     for (int n : B.M.tets[E]) isOfT[n] = 1;
   const auto isCoarse = [&](int E) {
     const std::array<int, 4>&z = B.M.tets[E], &label = B.M.faceLabel[E];
@@ -5225,7 +5208,7 @@ void findDiagonals(const Mesh& M, const Approximation& A, SquareSurface& Q) {
   const Lattice lattice(A.level);
   const KeyMap squareAt = squareNumbers(Q);
   std::array<std::int64_t, 3> half;
-  for (int E : elementsOf(A.T))
+  for (int E : markedOf(A.T))
     for (int i = 0; i < 4; ++i) {
       const std::array<int, 3> face = faceOpposite(M.tets[E], i);
       if (!lattice.squareOf(M, face, half)) continue;
@@ -5866,7 +5849,7 @@ void labelSurface(Bisection& B, const SquareSurface& Q, const Approximation& A,
   const KeyMap squareAt = squareNumbers(Q);
   std::array<std::int64_t, 3> half;
   std::vector<int> labelled;
-  for (int E : elementsOf(A.T))
+  for (int E : markedOf(A.T))
     for (int i = 0; i < 4; ++i) {
       const int other = B.neighbour[E][i];
       if (other < 0 || A.T[other]) continue;
@@ -5973,14 +5956,13 @@ bool bisectEdges(Bisection& B, SurfaceComplex& SM, const std::vector<std::pair<i
 }  // namespace
 
 bool refineTetrahedraWithTwoFaces(Bisection& B, SurfaceComplex& SM) {
-  std::vector<std::pair<int, int>> refine;  // tetrahedron, level
+  std::vector<int> refine;
   for (int E : SM.elements) {
     const std::array<int, 4>& label = B.M.faceLabel[E];
-    if (std::count(label.begin(), label.end(), SM.surface) > 1) refine.push_back({E, B.M.level[E]});
+    if (std::count(label.begin(), label.end(), SM.surface) > 1) refine.push_back(E);
   }
   const std::size_t splits = B.splits.size();
-  for (const auto& [E, level] : refine)
-    if (B.M.level[E] == level) B.bisect(E);
+  bisectOnce(B, refine);
   SM.update(B, splits);
   return !refine.empty();
 }
@@ -6846,10 +6828,6 @@ std::vector<int> placeNodes(Mesh& M, const ApproximatingSurface& SM, const std::
   return held;
 }
 
-}  // namespace
-
-namespace {
-
 /// [§3.6] surfaceProjection() with ϕ, which is the same for all ways and sizes.
 ProjectionReport projectTo(Mesh& M, const SurfaceDistance& S, SurfaceParametrization Phi,
                            bool followRim, const Crew& crew) {
@@ -6906,16 +6884,8 @@ namespace {
 
 /// Whether p lies in one of the tetrahedra.
 bool contains(const Mesh& M, Vec3 p) {
-  for (const std::array<int, 4>& z : M.tets) {
-    bool in = true;
-    for (int i = 0; i < 4 && in; ++i) {
-      const std::array<int, 3> v = faceOpposite(z, i);
-      const Vec3 normal = cross(M.x[v[1]] - M.x[v[0]], M.x[v[2]] - M.x[v[0]]);
-      in = dot(normal, p - M.x[v[0]]) * dot(normal, M.x[z[i]] - M.x[v[0]]) >= 0;
-    }
-    if (in) return true;
-  }
-  return false;
+  return std::any_of(M.tets.begin(), M.tets.end(),
+                     [&](const std::array<int, 4>& z) { return holds(M.x, z, p); });
 }
 
 void checkOptions(const InsertOptions& options, std::size_t nodes) {
@@ -7120,23 +7090,20 @@ std::vector<Way> extractWays(Insertion& I, Outline outline) {
 }
 
 /// Nodes of S_M and their neighbours: where the optimization starts.
-std::vector<int> nodesNear(const Mesh& M, int k) {
+std::vector<int> nodesNearSurface(const Mesh& M, int k) {
   std::vector<char> near(M.x.size(), 0), on(M.x.size(), 0);
   for (const auto& face : surfaceFaces(M, k))
     for (int n : face) on[n] = 1;
   for (const std::array<int, 4>& z : M.tets)
     if (on[z[0]] || on[z[1]] || on[z[2]] || on[z[3]])
       for (int n : z) near[n] = 1;
-  std::vector<int> nodes;
-  for (std::size_t n = 0; n < near.size(); ++n)
-    if (near[n]) nodes.push_back(static_cast<int>(n));
-  return nodes;
+  return markedOf(near);
 }
 
 /// Lowest q of the elements at S_M and of their neighbours.
 double lowestNear(const Mesh& M, int k) {
   std::vector<char> near(M.x.size(), 0);
-  for (int n : nodesNear(M, k)) near[n] = 1;
+  for (int n : nodesNearSurface(M, k)) near[n] = 1;
   double lowest = 1;
   for (const std::array<int, 4>& z : M.tets)
     if (near[z[0]] || near[z[1]] || near[z[2]] || near[z[3]])
@@ -7264,7 +7231,7 @@ bool insertOnWay(Insertion& I, const Way& way, bool patient, Mesh& M, InsertRepo
   project(I, M, report);
   I.stage("projected", M);
   I.progress("3.6 projection: " + std::to_string(report.projected.inverted) + " inverted");
-  optimizeAround(M, I, patient, nodesNear(M, I.k), report);
+  optimizeAround(M, I, patient, nodesNearSurface(M, I.k), report);
   report.smoothed = report.optimization.quality;
   I.progress("3.7 optimization: " + std::to_string(report.optimization.sweeps) + " sweeps, " +
              std::to_string(report.smoothed.inverted) + " inverted, min " +
@@ -7287,10 +7254,9 @@ void measureSurface(const Mesh& M, const SurfaceDistance& S, InsertReport& repor
                     const Crew& crew) {
   const std::vector<std::array<int, 3>> faces = surfaceFaces(M, report.surface);
   std::vector<char> on(M.x.size(), 0);
-  std::vector<int> nodes;
   for (const auto& face : faces)
-    for (int n : face)
-      if (!on[n]) on[n] = 1, nodes.push_back(n);
+    for (int n : face) on[n] = 1;
+  const std::vector<int> nodes = markedOf(on);
   report.nodes = static_cast<int>(nodes.size());
   std::vector<double> distance(nodes.size());
   crew.forPieces(0, report.nodes, queryPiece, [&](int, int from, int to) {
@@ -7341,17 +7307,13 @@ void judgeSurface(double h, InsertReport& report) {
                               " along S, more than 2 cube edges; lower l_c");
 }
 
-/// The points of a lattice on the triangle, `steps` along its edges, for which far(w) holds: their
+/// Calls visit(w) for the points of a lattice on a triangle, `steps` along its edges: w are their
 /// barycentric coordinates.
-template <class Far>
-std::vector<Vec3> latticeOn(int steps, Far far) {
-  std::vector<Vec3> found;
+template <class Visit>
+void forLattice(int steps, Visit visit) {
   for (int i = 0; i <= steps; ++i)
-    for (int j = 0; i + j <= steps; ++j) {
-      const Vec3 w = (1. / steps) * Vec3{double(steps - i - j), double(i), double(j)};
-      if (far(w)) found.push_back(w);
-    }
-  return found;
+    for (int j = 0; i + j <= steps; ++j)
+      visit((1. / steps) * Vec3{double(steps - i - j), double(i), double(j)});
 }
 
 Vec3 at(const std::array<Vec3, 3>& c, Vec3 w) { return w.x * c[0] + w.y * c[1] + w.z * c[2]; }
@@ -7370,19 +7332,19 @@ std::vector<std::array<int, 3>> farFaces(const Mesh& M, const SurfaceDistance& S
   std::vector<char> isFar(PM.triangles.size(), 0);
   for (std::size_t t = 0; t < isFar.size(); ++t) {
     const std::array<Vec3, 3> c = cornersOf(SM.S, static_cast<int>(t));
-    isFar[t] = !latticeOn(distanceSamples, [&](Vec3 w) {
-                  return triangleWithin(S.tree, at(c, w), allowed) < 0;
-                }).empty();
+    forLattice(distanceSamples, [&](Vec3 w) {
+      if (!isFar[t]) isFar[t] = triangleWithin(S.tree, at(c, w), allowed) < 0;
+    });
   }
   for (const std::array<int, 3>& t : P.triangles) {
     const std::array<Vec3, 3> c{P.points[t[0]], P.points[t[1]], P.points[t[2]]};
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int steps = std::max(distanceSamples, static_cast<int>(std::ceil(longest / spacing)));
-    for (Vec3 w :
-         latticeOn(steps, [&](Vec3 p) { return triangleWithin(tree, at(c, p), allowed) < 0; })) {
+    forLattice(steps, [&](Vec3 w) {
+      if (triangleWithin(tree, at(c, w), allowed) >= 0) return;
       const int inU = locate(PM, w.x * P.u[t[0]] + w.y * P.u[t[1]] + w.z * P.u[t[2]]).triangle;
       isFar[inU >= 0 ? inU : tree.closest(at(c, w)).triangle] = 1;  // beyond the rim the nearest
-    }
+    });
   }
   std::vector<std::array<int, 3>> faces;
   for (std::size_t t = 0; t < isFar.size(); ++t) {
@@ -7655,10 +7617,6 @@ void searchSize(Insertion& I, const std::vector<double>& sizes, Mesh& result,
                     std::to_string(I.faults) + " tries, the last because " + I.reason + "; " +
                     advice(I, M, sizes[0], last));
 }
-
-}  // namespace
-
-namespace {
 
 /// [choice] Beside earlier surfaces only nodes near S are smoothed (`optimizeAround`). Where the
 /// lowest q has become poor, all are once more: it rises by .03 to .07 in the real sets.
