@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: MIT
 //
-// Sections 2 to 3.6 of the paper: the box meccano and Kossaczký's bisection, volumetric
-// approximation and its healing, surface extraction and its healing, surface projection; and
-// insertSurface, which calls them in the paper's order. Section 3.7 is optimize.cpp.
+// Sections 2 to 3.6 of the paper. 2: the meccano (boxes, polycubes), its boundary mapping Π,
+// Kossaczký's bisection, terrain, and Algorithm 1 for solids. 3: volumetric approximation and its
+// healing, surface extraction and its healing, surface projection; and insertSurface, which calls
+// them in the paper's order. Section 3.7 is optimize.cpp.
 #include <algorithm>
 #include <cfloat>
 #include <cstdint>
@@ -2174,12 +2175,26 @@ int Bisection::tetWithEdge(int a, int b) const {
   return walkStar(a, around, [&](int t) { return localIndex(M.tets[t], b) >= 0; });
 }
 
+namespace {
+
+/// Calls found(curve, s) for the curves on which node n lies, until it is true.
+template <class Found>
+bool anyCurveAt(const Mesh& M, int n, Found found) {
+  if (M.dimension[n] == 1) return found(M.entity[n], M.parameter[n].x);
+  if (M.dimension[n] == 0)
+    for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
+      if (found(place.curve, place.s)) return true;
+  return false;
+}
+
+}  // namespace
+
 bool parameterOn(const Mesh& M, int n, int label, Vec2& u) {
   if (M.dimension[n] == 2 && M.entity[n] == label) {
     u = M.parameter[n];
     return true;
   }
-  auto onCurve = [&](int curve, double s) {
+  return anyCurveAt(M, n, [&](int curve, double s) {
     const Curve& C = M.curves[curve - 1];
     for (const Curve::Side& side : C.sides)
       if (side.surface == label) {
@@ -2187,12 +2202,7 @@ bool parameterOn(const Mesh& M, int n, int label, Vec2& u) {
         return true;
       }
     return false;
-  };
-  if (M.dimension[n] == 1) return onCurve(M.entity[n], M.parameter[n].x);
-  if (M.dimension[n] == 0)
-    for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
-      if (onCurve(place.curve, place.s)) return true;
-  return false;
+  });
 }
 
 namespace {
@@ -2245,17 +2255,10 @@ void checkMeccano(const Mesh& M, const std::string& who) {
 
 /// s of node n on curve c.
 bool parameterOnCurve(const Mesh& M, int n, int c, double& s) {
-  if (M.dimension[n] == 1 && M.entity[n] == c) {
-    s = M.parameter[n].x;
-    return true;
-  }
-  if (M.dimension[n] == 0)
-    for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
-      if (place.curve == c) {
-        s = place.s;
-        return true;
-      }
-  return false;
+  return anyCurveAt(M, n, [&](int curve, double there) {
+    if (curve == c) s = there;
+    return curve == c;
+  });
 }
 
 /// Midpoint in s, on a closed curve the shorter way round.
@@ -2268,25 +2271,18 @@ double curveMidpoint(const Curve& C, double s0, double s1) {
 
 /// The curve between the two labels on which both nodes lie; 0 if there is none.
 int commonCurve(const Mesh& M, int a, int b, int label0, int label1) {
-  auto curvesOf = [&](int n) {
-    std::vector<int> curves;
-    if (M.dimension[n] == 1) curves.push_back(M.entity[n]);
-    if (M.dimension[n] == 0)
-      for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
-        curves.push_back(place.curve);
-    return curves;
-  };
-  const std::vector<int> ofB = curvesOf(b);
-  for (int c : curvesOf(a)) {
-    if (std::find(ofB.begin(), ofB.end(), c) == ofB.end()) continue;
+  int common = 0;
+  anyCurveAt(M, a, [&](int c, double) {
     bool has0 = false, has1 = false;
     for (const Curve::Side& side : M.curves[c - 1].sides) {
       has0 |= side.surface == label0;
       has1 |= side.surface == label1;
     }
-    if (has0 && has1) return c;
-  }
-  return 0;
+    double s;
+    if (has0 && has1 && parameterOnCurve(M, b, c, s)) common = c;
+    return common > 0;
+  });
+  return common;
 }
 
 }  // namespace
@@ -4822,12 +4818,10 @@ KeyMap nodesOf(const Mesh& M, const Approximation& A) {
 
 /// Whether a node lies on ∂M. T may pass an earlier surface: its squares there are no candidates.
 bool isOnBoundary(const Mesh& M, int n) {
-  int curve = 0;
   if (M.dimension[n] == 2) return M.entity[n] < 0;
-  if (M.dimension[n] == 1) curve = M.entity[n];
-  if (M.dimension[n] == 0 && !M.corners[M.entity[n] - 1].on.empty())
-    curve = M.corners[M.entity[n] - 1].on[0].curve;
-  return curve > 0 && M.curves[curve - 1].sides[0].surface < 0;
+  int first = 0;
+  anyCurveAt(M, n, [&](int curve, double) { return (first = curve) > 0; });
+  return first > 0 && M.curves[first - 1].sides[0].surface < 0;
 }
 
 /// The elements adjacent to the node, refined to T's level, join T.
@@ -5063,8 +5057,9 @@ void refineCube(Bisection& B, int level, std::uint64_t cube, int node) {
 
 /// The cubes of 𝓣 and all around it, as S_M divides them; their elements may be coarser.
 struct DividedCubes {
-  std::vector<std::uint64_t> above, below, touching;  // sorted; of those below the touching ones
-};                                                    // touch one above
+  std::vector<std::uint64_t> above, below;  // sorted
+  std::vector<std::uint64_t> touching;      // of those below, the ones that touch one above
+};
 DividedCubes divideCubes(const Mesh& M, const Approximation& A, const SurfaceDistance& S,
                          double perDistance, const Crew& crew) {
   const Cubes cubes = cubesAround(M, A);
@@ -6466,6 +6461,7 @@ SurfaceParametrization parametrizeSurface(const SurfaceDistance& S) {
   Phi.surface.triangles = S.S.triangles;
   Phi.surface.name = S.S.name;
   Phi.surface.u = floaterParametrization(S.S.points, S.S.triangles, S.isRimPoint, u);
+  buildLocator(Phi.surface);
   return Phi;
 }
 
@@ -6853,13 +6849,6 @@ ProjectionReport projectTo(Mesh& M, const SurfaceDistance& S, SurfaceParametriza
   return report;
 }
 
-/// ϕ, eq. (3), with its locator.
-SurfaceParametrization locatedParametrization(const SurfaceDistance& S) {
-  SurfaceParametrization Phi = parametrizeSurface(S);
-  buildLocator(Phi.surface);
-  return Phi;
-}
-
 }  // namespace
 
 ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool followRim) {
@@ -6867,7 +6856,7 @@ ProjectionReport surfaceProjection(Mesh& M, const TriangleSurface& cleaned, bool
   splitChords(split);
   const SurfaceDistance S(split);
   const Crew alone;
-  return projectTo(M, S, locatedParametrization(S), followRim, alone);
+  return projectTo(M, S, parametrizeSurface(S), followRim, alone);
 }
 
 // ==== 3. Surface insertion =======================================================================
@@ -6979,12 +6968,12 @@ struct Insertion {
   Layer layer = {};
   SurfaceParametrization Phi = {};  // of S, once the first way needs it
   int ways = 0;                     // tried so far, over all l_c
-  int faults = 0;                   // and left; why the last one was, without prefix and advice
-  std::string reason = {};
-  bool isBlocked = false;   // at this l_c, by an earlier surface
-  bool wasBlocked = false;  // at some l_c
-  double lowest = 0;        // q of the best way so far
-  double worth = 0;         // and that with its mean
+  int faults = 0;                   // of which left,
+  std::string reason = {};          // the last one why, without prefix and advice
+  bool isBlocked = false;           // at this l_c, by an earlier surface
+  bool wasBlocked = false;          // at some l_c
+  double lowest = 0;                // q of the best way so far
+  double worth = 0;                 // and that with its mean
 
   void stage(const char* name, const Mesh& mesh) const {
     if (options.onStage) options.onStage(name, mesh);
@@ -7114,12 +7103,10 @@ double lowestNear(const Mesh& M, int k) {
 
 /// Lets a node fixed at a sharp corner of S slide along the rim.
 void releaseCorner(Mesh& M, int n, int k) {
-  if (M.dimension[n] != 0) return;
-  for (const Corner::Place& place : M.corners[M.entity[n] - 1].on)
-    if (place.curve == M.surfaces[k - 1].rim) {
-      M.dimension[n] = 1, M.entity[n] = place.curve, M.parameter[n] = {place.s, 0};
-      return;
-    }
+  const int rim = M.surfaces[k - 1].rim;
+  double s;
+  if (M.dimension[n] == 0 && parameterOnCurve(M, n, rim, s))
+    M.dimension[n] = 1, M.entity[n] = rim, M.parameter[n] = {s, 0};
 }
 
 /// Releases the corners of these elements and bisects them: more freedom. Returns the nodes around.
@@ -7214,7 +7201,7 @@ void project(Insertion& I, Mesh& M, InsertReport& report) {
   const std::vector<double> healed = qualities(M, I.original.x, I.q);
   const std::vector<Vec3> before = M.x;
   report.refined = qualityStatistics(healed);
-  if (I.Phi.surface.u.empty()) I.Phi = locatedParametrization(I.S);
+  if (I.Phi.surface.u.empty()) I.Phi = parametrizeSurface(I.S);
   const ProjectionReport projection = projectTo(M, I.S, I.Phi, I.options.followRim, I.crew);
   report.tangentialShift = projection.tangentialShift;
   report.projected = qualityStatistics(qualities(M, before, healed));

@@ -950,7 +950,7 @@ RimCorners rimCorners(const SurfaceDistance& S);
 /// [§3.6, eq. (3)] ϕ: 𝓤 → S with its rim as a closed curve that starts at a corner; the four arcs
 /// between the corners go to the four sides of 𝓤 by arc length.
 struct SurfaceParametrization {
-  Parametrization surface;        // S with chords split; without locator
+  Parametrization surface;        // S with chords split
   Curve rim;                      // sides[0].u at its points; its surface number is not yet set
   std::array<double, 4> cornerS;  // arc length of the four corners, the first is 0
   std::array<bool, 4> sharp;
