@@ -1162,55 +1162,8 @@ void build(Smoother& S) {
   fillSheets(S, faces);
 }
 
-Mat3 jacobianOf(const Smoother& S, int E) {
-  const std::array<int, 4>& tet = S.M.tets[E];
-  const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
-  const Vec3 x = S.M.x[tet[0]];
-  Mat3 J{};
-  for (int k = 1; k < 4; ++k) J = J + outer(S.M.x[tet[k]] - x, g[k]);
-  return J;
-}
-
 double sigmaOf(const Smoother& S, int E) {
   return signedVolume6(cornersOf(S.M.x, S.M.tets[E])) * S.corners[4 * S.shapeOf[E]].perVolume;
-}
-
-/// [choice] Of lower q a valid element counts as flat while `Smoother::flat`.
-constexpr double flatQuality = 1e-4;
-
-/// Whether q = 3 σ^(2/3)/‖J‖² is below flatQuality.
-bool isFlat(const Smoother& S, int E) {
-  constexpr double third = flatQuality / 3;
-  const Mat3 J = jacobianOf(S, E);
-  const double sigma = det(J), size2 = third * norm2(J);
-  return sigma * sigma < size2 * size2 * size2;
-}
-
-struct Validity {
-  int inverted = 0, flat = 0;
-  double sigmaMin = unbounded;  // 0 at most where an element is flat
-
-  void operator+=(const Validity& other) {
-    inverted += other.inverted;
-    flat += other.flat;
-    sigmaMin = std::min(sigmaMin, other.sigmaMin);
-  }
-};
-Validity validity(const Smoother& S) {
-  const auto ofPiece = [&S](int from, int to) {
-    Validity v;
-    for (int i = from; i < to; ++i) {
-      const double sigma = sigmaOf(S, S.elements[i]);
-      if (!(sigma > 0))
-        v += {1, 0, sigma};
-      else if (S.flat && isFlat(S, S.elements[i]))
-        v += {0, 1, 0};
-      else
-        v += {0, 0, sigma};
-    }
-    return v;
-  };
-  return sumOfPieces<Validity>(S.crew, 0, static_cast<int>(S.elements.size()), piece, ofPiece);
 }
 
 /// q of these elements, from the closed form at their first vertex.
@@ -1743,6 +1696,15 @@ struct Functional {
 /// to 0 there; with 1/8 the cube turned by 3 rad stays tangled.
 constexpr double volumeWeight = 1;
 
+Mat3 jacobianOf(const Smoother& S, int E) {
+  const std::array<int, 4>& tet = S.M.tets[E];
+  const std::array<Vec3, 4>& g = S.gradients[S.shapeOf[E]];
+  const Vec3 x = S.M.x[tet[0]];
+  Mat3 J{};
+  for (int k = 1; k < 4; ++k) J = J + outer(S.M.x[tet[k]] - x, g[k]);
+  return J;
+}
+
 /// Σ η + (1 + σ²)/(2h) over the mesh, with its gradient at the free inner nodes, σ_min, and the
 /// diagonal of the Hessian's part 2 η |g|²/N.
 ///   source  Garanzha et al., Foldover-free maps in 50 lines of code
@@ -1922,6 +1884,45 @@ constexpr int easySweeps = 10;
 /// with a δ of each star, which is 0 there all the same.
 constexpr int flatSweeps = 20;
 
+/// [choice] Of lower q a valid element counts as flat while `Smoother::flat`.
+constexpr double flatQuality = 1e-4;
+
+/// Whether q = 3 σ^(2/3)/‖J‖² is below flatQuality.
+bool isFlat(const Smoother& S, int E) {
+  constexpr double third = flatQuality / 3;
+  const Mat3 J = jacobianOf(S, E);
+  const double sigma = det(J), size2 = third * norm2(J);
+  return sigma * sigma < size2 * size2 * size2;
+}
+
+struct Validity {
+  int inverted = 0, flat = 0;
+  double sigmaMin = unbounded;  // 0 at most where an element is flat
+
+  void operator+=(const Validity& other) {
+    inverted += other.inverted;
+    flat += other.flat;
+    sigmaMin = std::min(sigmaMin, other.sigmaMin);
+  }
+};
+/// Of all elements that may change.
+///   wakes  the nodes of those inverted or flat, for δ may have changed where nothing has moved
+Validity validity(Smoother& S, bool wakes) {
+  const auto ofPiece = [&S, wakes](int from, int to) {
+    Validity v;
+    for (int i = from; i < to; ++i) {
+      const int E = S.elements[i];
+      const double sigma = sigmaOf(S, E);
+      const bool inverted = !(sigma > 0), flat = !inverted && S.flat && isFlat(S, E);
+      v += {inverted, flat, flat ? 0 : sigma};
+      if (wakes && (inverted || flat))
+        for (int n : S.M.tets[E]) wakeNode(S, n);
+    }
+    return v;
+  };
+  return sumOfPieces<Validity>(S.crew, 0, static_cast<int>(S.elements.size()), piece, ofPiece);
+}
+
 /// μ of the sweep: the next rung where the number of inverted elements does not fall.
 struct MuSchedule {
   int rung = 0, fewest = std::numeric_limits<int>::max(), waited = 0, tangledSweeps = 0;
@@ -1940,15 +1941,6 @@ struct MuSchedule {
     return mu * muLadder[rung];
   }
 };
-
-/// For δ may have changed where nothing has moved.
-void wakeInverted(Smoother& S) {
-  S.crew.forPieces(0, static_cast<int>(S.elements.size()), piece, [&](int, int from, int to) {
-    for (int i = from; i < to; ++i)
-      if (!(sigmaOf(S, S.elements[i]) > 0) || (S.flat && isFlat(S, S.elements[i])))
-        for (int n : S.M.tets[S.elements[i]]) wakeNode(S, n);
-  });
-}
 
 /// The nodes' places, and those of sliding ones on their surfaces and curves.
 struct Positions {
@@ -1971,7 +1963,7 @@ bool sweepUntilSettled(Smoother& S, Positions& lastValid) {
   Anderson acceleration(S);
   while (sweepsLeft(S)) {
     S.flat = tangled && S.report.sweeps < flatUntil;
-    const Validity v = tangled ? validity(S) : Validity{0, 0, 1};
+    const Validity v = tangled ? validity(S, wakesLess) : Validity{0, 0, 1};
     tangled = v.inverted + v.flat > 0;
     if (tangled && v.inverted == 0) lastValid = {S.M.x, S.M.parameter};
     if (tangled && !S.options.globalDescent && schedule.isHopeless(v.inverted)) return false;
@@ -1982,7 +1974,6 @@ bool sweepUntilSettled(Smoother& S, Positions& lastValid) {
       for (int n : S.order) wakeNode(S, n);
       continue;
     }
-    if (wakesLess && tangled) wakeInverted(S);
     if (wakesLess && S.tangled && !tangled)
       for (int n : S.order) wakeNode(S, n);
     S.wake = tangled && wakesLess ? tangledWake : wake;
@@ -2006,7 +1997,7 @@ bool sweepUntilSettled(Smoother& S, Positions& lastValid) {
 bool untangleAndSmooth(Smoother& S) {
   Positions lastValid;
   const bool converged = sweepUntilSettled(S, lastValid);
-  if (!converged && !lastValid.x.empty() && validity(S).inverted > 0)
+  if (!converged && !lastValid.x.empty() && validity(S, false).inverted > 0)
     S.M.x = lastValid.x, S.M.parameter = lastValid.parameter;
   return converged;
 }
