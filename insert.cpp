@@ -7126,13 +7126,22 @@ std::vector<int> loosen(Mesh& M, const std::vector<int>& elements, int k) {
   return nodes;
 }
 
+/// A global descent of the nodes around these elements, for what no single node can leave.
+OptimizeReport descendAround(Mesh& M, const std::vector<int>& elements, OptimizeOptions optimize) {
+  optimize.globalDescent = true, optimize.maxTangledSweeps = 1, optimize.active.clear();
+  for (int E : elements)
+    optimize.active.insert(optimize.active.end(), M.tets[E].begin(), M.tets[E].end());
+  return optimizeMesh(M, optimize);
+}
+
 /// [choice] Tangled sweeps after which a way is put aside while there are others: most are valid
 /// after 1 to 4, and those that need more are seldom better in the end (by .01 in the lowest q).
 constexpr int impatientSweeps = 12;
 
 /// §3.7, and [departure] where a few elements stay inverted, or poor as where S_M bridges a slit:
-/// these are loosened, as long as there are fewer inverted ones, or the lowest q rises. No global
-/// descent here: other ways of inserting S are cheaper.
+/// these are loosened, as long as there are fewer inverted ones, or the lowest q rises; where that
+/// does not help inverted ones, the nodes around them descend together. No global descent of all:
+/// other ways of inserting S are cheaper.
 ///   patient  false: a mesh that is still tangled after a few sweeps is left as it is
 ///   active   the nodes to start from
 void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector<int>& active,
@@ -7140,7 +7149,8 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
   constexpr int maxRounds = 8;
   constexpr int patientSweeps = 150;  // while tangled, of a loosened mesh: few elements are left
   constexpr std::size_t few = 60;
-  constexpr double poorQuality = .55;  // below it the worst are loosened: those below
+  constexpr double leastDescended = .1;  // what a descent has to reach: half of l_c is better then
+  constexpr double poorQuality = .55;    // below it the worst are loosened: those below
   constexpr double factors[] = {1.1, 1.3, 1.7, 2.2};  // of the lowest q, in turn while it stays
   OptimizeOptions optimize = I.options.optimize;
   optimize.globalDescent = false;
@@ -7151,6 +7161,8 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
   if (!patient && best.inverted > 0) return;
   optimize.maxTangledSweeps = I.options.optimize.maxTangledSweeps;  // loosened it may need them
   const double* factor = std::begin(factors);
+  const bool mayDescend = I.options.optimize.globalDescent;
+  bool descends = false;  // in this round
   for (int round = 0; round < maxRounds; ++round) {
     const bool valid = best.inverted == 0;
     if (valid && (optimize.power == 1 || best.minQ >= poorQuality)) return;
@@ -7160,15 +7172,20 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
       if (q[E] <= *factor * best.minQ) bad.push_back(static_cast<int>(E));
     if (bad.size() > few) return;
     Mesh trial = M;
-    optimize.active = loosen(trial, bad, I.k);
+    if (!descends) optimize.active = loosen(trial, bad, I.k);
     if (!valid) optimize.active.clear(), optimize.maxTangledSweeps = patientSweeps;
-    OptimizeReport after = optimizeMesh(trial, optimize);
+    OptimizeReport after =
+        descends ? descendAround(trial, bad, optimize) : optimizeMesh(trial, optimize);
     after.sweeps += best.sweeps;
     after.visits += best.visits;
     const bool better =
-        valid ? after.inverted == 0 && after.minQ > best.minQ : after.inverted < best.inverted;
-    if (!better && (!valid || ++factor == std::end(factors))) return;
-    if (better) M = std::move(trial), best = after;
+        valid ? after.inverted == 0 && after.minQ > best.minQ
+              : after.inverted < best.inverted && (!descends || after.minQ >= leastDescended);
+    if (better)
+      M = std::move(trial), best = after;
+    else if (valid ? ++factor == std::end(factors) : descends || !mayDescend)
+      return;
+    descends = !valid && !better;
   }
 }
 

@@ -231,7 +231,8 @@ struct OptimizeOptions {
   bool numericalDerivatives = false;  // §3.7.3: derivatives in u and s by differences, as printed
   // most meshes are valid after 20; then [departure] the global descent, if wanted
   int maxTangledSweeps = 60;
-  // [departure] all nodes at once, for states that no single node can leave
+  // [departure] all nodes at once, for states that no single node can leave; in an insertion only
+  // those around a few inverted elements
   bool globalDescent = true;
   double mu = 8e-3;  // h(σ_min) that δ gives, relative to the mean σ; (0, 1)
   // [§3.7.4 departure] first trial step, in Newton steps; [1, 2), 1: as printed

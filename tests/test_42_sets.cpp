@@ -3,6 +3,8 @@
 #include <doctest/doctest.h>
 
 #include <algorithm>
+#include <cmath>
+#include <functional>
 #include <string>
 #include <vector>
 
@@ -37,6 +39,30 @@ const TriangleSurface& named(const std::vector<TriangleSurface>& S, const std::s
     if (one.name == name) return one;
   FAIL("no surface " << name);
   return S[0];
+}
+
+/// A sheet around the middle of the unit cube, cut from there to its rim along x = .5. Its points
+/// are moved by move(d, half): d from the middle, −1 the left half, 1 the right one.
+TriangleSurface slitSheet(int n, const std::function<Vec3(Vec3 d, int half)>& move) {
+  const Vec3 middle{.5, .5, .5};
+  TriangleSurface S = samples::sheet(n, n, [&](double s, double t) {
+    return middle + .3 * Vec3{s, t, 0};
+  });
+  const std::size_t count = S.points.size();
+  std::vector<int> twin(count, -1);  // on the right side of the cut
+  for (std::size_t i = 0; i < count; ++i)
+    if (const Vec3 p = S.points[i]; std::abs(p.x - .5) < 1e-9 && p.y > .51)
+      twin[i] = static_cast<int>(S.points.size()), S.points.push_back(p);
+  for (auto& t : S.triangles) {
+    const bool isRight = S.points[t[0]].x + S.points[t[1]].x + S.points[t[2]].x > 1.5;
+    for (int& i : t)
+      if (isRight && twin[i] >= 0) i = twin[i];
+  }
+  for (std::size_t i = 0; i < S.points.size(); ++i) {
+    const Vec3 d = S.points[i] - middle;
+    S.points[i] += move(d, i < count && d.x < 1e-9 ? -1 : 1);
+  }
+  return S;
 }
 
 /// Each surface of the call is a disk of the mesh on its own S, by its name.
@@ -273,32 +299,35 @@ TEST_SUITE("4.2") {
     CHECK(onBoundary > 0);
   }
 
+  TEST_CASE("sets: around a few elements that stay inverted the nodes descend together") {
+    // a relay ramp: the halves overlap farther than they are apart
+    const TriangleSurface S = slitSheet(8, [](Vec3 d, int half) {
+      const double along = d.y > 0 ? std::pow(std::sin(d.y / .6 * std::acos(-1.)), 2) : 0;
+      const double across = 1 - std::abs(d.x) / .3, bend = .07 * std::sin(3 * d.x + 2 * d.y);
+      return half * along * across * Vec3{-.1, 0, .03} + Vec3{0, 0, bend};
+    });
+    InsertOptions options;
+    options.lc = .13, options.outline = Outline::squares;
+    Mesh M = box();
+    const InsertReport report = insertSurface(M, S, options);
+    CHECK(report.lc == options.lc);
+    CHECK(shapes::countInverted(M) == 0);
+    CHECK(shapes::isDisk(surfaceFaces(M, 1)));
+    CHECK(shapes::maxDistanceToSurface(M, 1, S) <= 1e-12 * shapes::diagonal(S));
+    CHECK(report.smoothed.min > .5);  // of the ways that are valid without it .35
+    options.optimize.globalDescent = false;
+    M = box();
+    CHECK(insertSurface(M, S, options).smoothed.min < .5);
+  }
+
   TEST_CASE("sets: a slit narrower than the cubes is bridged, its rims overlapping or not") {
     for (double overlap : {-.01, .02}) {
       CAPTURE(overlap);
-      TriangleSurface S = samples::sheet(24, 24, [](double s, double t) {
-        return Vec3{.5 + .3 * s, .5 + .3 * t, .5};
+      // along the cut the halves open or overlap
+      const TriangleSurface S = slitSheet(24, [=](Vec3 d, int half) {
+        const bool isCut = std::abs(d.x) < 1e-9 && d.y > .01;
+        return isCut ? half * d.y / .3 * Vec3{-overlap, 0, .02} : Vec3{0, 0, 0};
       });
-      // the sheet is cut from its middle to its rim along x = .5; the halves open or overlap
-      const std::size_t count = S.points.size();
-      std::vector<int> twin(count, -1);
-      for (std::size_t n = 0; n < count; ++n)
-        if (std::abs(S.points[n].x - .5) < 1e-9 && S.points[n].y > .51) {
-          twin[n] = static_cast<int>(S.points.size());
-          S.points.push_back(S.points[n]);
-        }
-      for (auto& t : S.triangles) {
-        double x = 0;
-        for (int n : t) x += S.points[n].x / 3;
-        for (int& n : t)
-          if (x > .5 && twin[n] >= 0) n = twin[n];
-      }
-      for (std::size_t n = 0; n < count; ++n)
-        if (twin[n] >= 0) {
-          const double open = (S.points[n].y - .5) / .3;
-          S.points[n] += open * Vec3{overlap, 0, -.02};
-          S.points[twin[n]] += open * Vec3{-overlap, 0, .02};
-        }
       Mesh M = box();
       InsertOptions options;
       options.lc = .12;
