@@ -3600,6 +3600,14 @@ std::vector<int> componentSizes(const std::vector<std::array<int, 3>>& neighbour
   return sizes;
 }
 
+void checkOnePart(const std::vector<std::array<int, 3>>& neighbours, const std::string& advice) {
+  const std::vector<int> sizes = componentSizes(neighbours);
+  if (sizes.size() > 1)
+    refuseSurface("the surface has " + std::to_string(sizes.size()) +
+                  " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
+                  std::to_string(sizes.back()) + " triangles); " + advice);
+}
+
 /// Turns triangles until all agree, the minority if there is one; S is connected.
 ///   returns how many were turned, or -1 at a Möbius band
 int orientConsistently(TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours) {
@@ -3624,6 +3632,16 @@ int orientConsistently(TriangleSurface& S, const std::vector<std::array<int, 3>>
   for (int t = 0; t < N; ++t)
     if (turn[t] == minority) std::swap(S.triangles[t][1], S.triangles[t][2]);
   return std::min(ones, N - ones);
+}
+
+/// The same with a warning of the section that asks for it. False at a Möbius band.
+bool orient(TriangleSurface& S, const std::vector<std::array<int, 3>>& neighbours,
+            const std::string& section, std::vector<std::string>& warnings) {
+  const int turned = orientConsistently(S, neighbours);
+  if (turned > 0)
+    warnings.push_back(section + ": turned " + counted(turned, "triangle") +
+                       " to give the surface a single orientation");
+  return turned >= 0;
 }
 
 /// Refuses what is no disk: S is connected, manifold and oriented.
@@ -3762,17 +3780,9 @@ TriangleSurface checkSurface(const TriangleSurface& S, std::vector<std::string>&
                   " triangles have zero area; check its coordinates");
   const std::vector<std::array<int, 3>> neighbours = triangleNeighbours(C.S, C.origin);
   checkFans(C, neighbours);
-  const std::vector<int> sizes = componentSizes(neighbours);
-  if (sizes.size() > 1)
-    refuseSurface("the surface has " + std::to_string(sizes.size()) +
-                  " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
-                  std::to_string(sizes.back()) +
-                  " triangles); insert them one by one, or by insertSurfaces");
-  const int turned = orientConsistently(C.S, neighbours);
-  if (turned < 0) refuseSurface("the surface is not orientable (a Moebius band); cut it open");
-  if (turned > 0)
-    warnings.push_back("§3.1: turned " + counted(turned, "triangle") +
-                       " to give the surface a single orientation");
+  checkOnePart(neighbours, "insert them one by one, or by insertSurfaces");
+  if (!orient(C.S, neighbours, "§3.1", warnings))
+    refuseSurface("the surface is not orientable (a Moebius band); cut it open");
   checkDisk(C.S);
   return C.S;
 }
@@ -3791,16 +3801,9 @@ void checkClosed(CleanSurface& C, std::vector<std::string>& warnings) {
                       " has the edge from " + placeText(S.points[S.triangles[t][i]]) + " to " +
                       placeText(S.points[S.triangles[t][(i + 1) % 3]]) + "; close it");
   checkFans(C, neighbours);
-  const std::vector<int> sizes = componentSizes(neighbours);
-  if (sizes.size() > 1)
-    refuseSurface("the surface has " + std::to_string(sizes.size()) +
-                  " components (the largest of " + std::to_string(sizes[0]) + ", the smallest of " +
-                  std::to_string(sizes.back()) + " triangles); mesh them one by one");
-  const int turned = orientConsistently(S, neighbours);
-  if (turned < 0) refuseSurface("the surface is not orientable; it bounds no solid");
-  if (turned > 0)
-    warnings.push_back("§2: turned " + counted(turned, "triangle") +
-                       " to give the surface a single orientation");
+  checkOnePart(neighbours, "mesh them one by one");
+  if (!orient(S, neighbours, "§2", warnings))
+    refuseSurface("the surface is not orientable; it bounds no solid");
   double volume = 0, area = 0;
   for (const std::array<int, 3>& t : S.triangles) {
     const Vec3 a = S.points[t[0]] - S.points[0], b = S.points[t[1]] - S.points[0],
@@ -4173,6 +4176,12 @@ double areaOf(const TriangleSurface& S, int t) {
   return .5 * norm(cross(c[1] - c[0], c[2] - c[0]));
 }
 
+double areaOf(const TriangleSurface& S) {
+  double area = 0;
+  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) area += areaOf(S, t);
+  return area;
+}
+
 /// Whether two triangles cross or touch beyond what they share: an edge of one, without a point of
 /// the other, meets the other. Those with a common edge do not.
 bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
@@ -4356,8 +4365,8 @@ Width lowQuantile(std::vector<Width> widths) {
 
 Width facingSheets(const SurfaceDistance& S, double reach) {
   constexpr int samples = 4000;  // [choice] spread evenly over the area
-  double area = 0, passed = 0;
-  for (int t = 0; t < static_cast<int>(S.S.triangles.size()); ++t) area += areaOf(S.S, t);
+  const double area = areaOf(S.S);
+  double passed = 0;
   std::vector<Width> widths;
   for (int t = 0; t < static_cast<int>(S.S.triangles.size()); ++t) {
     const std::array<Vec3, 3> c = cornersOf(S.S, t);
@@ -4596,12 +4605,6 @@ double cubeEdge(const Mesh& M, int level) {
 /// The faces of ∂𝓜, of all patches.
 std::vector<std::array<int, 3>> patchFaces(const Mesh& M) {
   return labelledFaces(M, [](int label, const auto&) { return label < 0; });
-}
-
-double areaOf(const TriangleSurface& S) {
-  double area = 0;
-  for (int t = 0; t < static_cast<int>(S.triangles.size()); ++t) area += areaOf(S, t);
-  return area;
 }
 
 constexpr double aboveDiagonal = 1 + 1e-9;  // eq. (1) refines where r^E >= l_c
@@ -5230,6 +5233,23 @@ void collectNodes(SquareSurface& Q, int meshNodes) {
     for (int e = 0; e < 4; ++e) Q.around[next[Q.squares[i].node[e]]++] = {static_cast<int>(i), e};
 }
 
+/// The edge-connected parts of the squares for which in(square), numbered from 1; sizes by number.
+template <class In>
+std::vector<int> connectedParts(const SquareSurface& Q, In in, std::vector<int>& sizes) {
+  std::vector<int> part(Q.squares.size(), 0), queue;
+  sizes.assign(1, 0);
+  for (int first = 0; first < static_cast<int>(part.size()); ++first) {
+    if (part[first] || !in(first)) continue;
+    queue.assign(1, first);
+    part[first] = static_cast<int>(sizes.size());
+    for (std::size_t i = 0; i < queue.size(); ++i)
+      for (int next : Q.squares[queue[i]].across)
+        if (!part[next] && in(next)) part[next] = part[first], queue.push_back(next);
+    sizes.push_back(static_cast<int>(queue.size()));
+  }
+  return part;
+}
+
 }  // namespace
 
 SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
@@ -5243,15 +5263,13 @@ SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
 
   // ∂T must be one sphere: V − E + F = 2 with E = 2 F, and connected.
   const int euler = static_cast<int>(Q.nodes.size()) - static_cast<int>(Q.squares.size());
-  std::vector<int> part(1, 0);
-  std::vector<char> seen(Q.squares.size(), 0);
-  if (!seen.empty()) seen[0] = 1;
-  for (std::size_t i = 0; i < part.size() && !seen.empty(); ++i)
-    for (int next : Q.squares[part[i]].across)
-      if (!seen[next]) seen[next] = 1, part.push_back(next);
-  if (euler != 2 || part.size() != Q.squares.size())
+  std::vector<int> sizes;
+  connectedParts(
+      Q, [](int) { return true; }, sizes);
+  if (euler != 2 || sizes.size() != 2)
     Q.fault = "the boundary of T is no sphere (chi = " + std::to_string(euler) + ", " +
-              std::to_string(part.size()) + " of " + std::to_string(Q.squares.size()) +
+              std::to_string(sizes.size() > 1 ? sizes[1] : 0) + " of " +
+              std::to_string(Q.squares.size()) +
               " squares connected): S comes close to itself within l_c";
   return Q;
 }
@@ -5345,23 +5363,6 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
 }
 
 constexpr unsigned char emptySquare = 0, fullSquare = 15;
-
-/// The edge-connected parts of the squares for which in(square), numbered from 1; sizes by number.
-template <class In>
-std::vector<int> connectedParts(const SquareSurface& Q, In in, std::vector<int>& sizes) {
-  std::vector<int> part(Q.squares.size(), 0), queue;
-  sizes.assign(1, 0);
-  for (int first = 0; first < static_cast<int>(part.size()); ++first) {
-    if (part[first] || !in(first)) continue;
-    queue.assign(1, first);
-    part[first] = static_cast<int>(sizes.size());
-    for (std::size_t i = 0; i < queue.size(); ++i)
-      for (int next : Q.squares[queue[i]].across)
-        if (!part[next] && in(next)) part[next] = part[first], queue.push_back(next);
-    sizes.push_back(static_cast<int>(queue.size()));
-  }
-  return part;
-}
 
 int largestPart(const std::vector<int>& sizes) {
   return static_cast<int>(std::max_element(sizes.begin(), sizes.end()) - sizes.begin());
@@ -7398,8 +7399,8 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
 
 /// Follows one way; keeps its mesh and report where it is the best valid one so far.
 ///   returns  false: put aside
-bool tryWay(Insertion& I, const Way& way, bool patient, double lc, Mesh& result,
-            InsertReport& report) {
+bool tryWay(Insertion& I, const Way& way, bool patient, Mesh& result, InsertReport& report) {
+  const double lc = I.layer.lc;
   Mesh trial;
   InsertReport ofThisWay;
   ofThisWay.original = report.original;
@@ -7452,7 +7453,7 @@ bool isGood(const Insertion& I, const InsertReport& report) {
 }
 
 /// The ways of a layer until one is good; those put aside because they stay tangled are returned.
-std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& report) {
+std::vector<Way> tryWays(Insertion& I, Mesh& result, InsertReport& report) {
   const bool isPaper = I.options.outline == Outline::paper;
   std::vector<Outline> outlines{I.options.outline};
   if (I.options.outline == Outline::halfSquares) outlines.push_back(Outline::squares);
@@ -7465,7 +7466,7 @@ std::vector<Way> tryWays(Insertion& I, double lc, Mesh& result, InsertReport& re
         if (isGood(I, report) || std::find(tried.begin(), tried.end(), selected) != tried.end())
           continue;
         tried.push_back(selected);
-        if (!tryWay(I, way, isPaper, lc, result, report)) aside.push_back(way);
+        if (!tryWay(I, way, isPaper, result, report)) aside.push_back(way);
       }
   return aside;
 }
@@ -7490,7 +7491,7 @@ void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report)
     if (course == Course::centres ? isEnough() : isGood(I, report)) continue;
     try {
       prepare(I, lc, course);
-      aside.push_back({course, tryWays(I, lc, result, report)});
+      aside.push_back({course, tryWays(I, result, report)});
     } catch (const MethodError& error) {
       if (report.surface == 0 && !I.layer.A.isMiddle) throw;  // 𝓣 itself fails, on every course
       I.leave(isSides ? "sides" : "middle", error);
@@ -7500,7 +7501,7 @@ void insertWithSize(Insertion& I, double lc, Mesh& result, InsertReport& report)
     if (ways.empty() || isEnough()) continue;
     prepare(I, lc, course);
     for (const Way& way : ways)
-      if (!isEnough()) tryWay(I, way, true, lc, result, report);
+      if (!isEnough()) tryWay(I, way, true, result, report);
   }
 }
 
