@@ -3991,7 +3991,6 @@ namespace {
 /// point.
 class NearTriangle {
  public:
-  NearTriangle() = default;
   explicit NearTriangle(const std::array<Vec3, 3>& corners)
       : c_(corners),
         edge_{c_[1] - c_[0], c_[2] - c_[1], c_[0] - c_[2]},
@@ -4039,8 +4038,10 @@ ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
   if (nodes.empty()) return best;
   // so much nearer NearTriangle sees for certain, and equal distances go to the lowest triangle
-  constexpr double ofDistance = 1e-9, ofDiagonal = 1e-12;
-  const double rounding = ofDiagonal * norm(nodes[0].box.hi - nodes[0].box.lo);
+  constexpr double ofDistance = 1e-9, ofDiagonal = 1e-12, ofCoordinates = 1e-15;
+  const Box& box = nodes[0].box;
+  const double rounding =
+      ofDiagonal * norm(box.hi - box.lo) + ofCoordinates * (norm(box.hi) + norm(box.lo));
   visitNearest(*this, 0, boxDistance2(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
     if (!NearTriangle(corners[i])(x, (1 + ofDistance) * best.distance + rounding)) return;
     ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
@@ -4216,8 +4217,8 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
                       Width largest, int from, int to) {
   constexpr double mostSteps = 1000;
   // the triangles of B that were near last: neighbours in A are so to the same
-  std::array<NearTriangle, 4> recent;
-  recent.fill(NearTriangle(B.corners[0]));
+  const NearTriangle first(B.corners[0]);
+  std::array<NearTriangle, 4> recent{first, first, first, first};
   const auto isNearRecent = [&](Vec3 p) {
     for (NearTriangle& isNear : recent)
       if (isNear(p, largest.distance)) {
@@ -4229,9 +4230,10 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
   const auto findNear = [&](Vec3 p) {
     if (isNearRecent(p)) return true;
     const int near = triangleWithin(B, p, largest.distance);
-    if (near >= 0)
-      std::rotate(recent.begin(), recent.end() - 1, recent.end()),
-          recent[0] = NearTriangle(B.corners[near]);
+    if (near >= 0) {
+      std::rotate(recent.begin(), recent.end() - 1, recent.end());
+      recent[0] = NearTriangle(B.corners[near]);
+    }
     return near >= 0;
   };
   KeyMap had(3 * (to - from) / 2);  // edge → steps of the lattice whose points on it were looked at
@@ -6867,6 +6869,7 @@ InsertOptions InsertOptions::paper() {
   options.outline = Outline::paper;
   options.followRim = false;
   options.optimize = OptimizeOptions::paper();
+  options.optimize.globalDescent = false;
   return options;
 }
 
@@ -7162,8 +7165,6 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
   if (!patient && best.inverted > 0) return;
   optimize.maxTangledSweeps = I.options.optimize.maxTangledSweeps;  // loosened it may need them
   const double* factor = std::begin(factors);
-  const bool mayDescend = I.options.optimize.globalDescent;
-  bool descends = false;  // in this round
   for (int round = 0; round < maxRounds; ++round) {
     const bool valid = best.inverted == 0;
     if (valid && (optimize.power == 1 || best.minQ >= poorQuality)) return;
@@ -7173,20 +7174,20 @@ void optimizeAround(Mesh& M, const Insertion& I, bool patient, const std::vector
       if (q[E] <= *factor * best.minQ) bad.push_back(static_cast<int>(E));
     if (bad.size() > few) return;
     Mesh trial = M;
-    if (!descends) optimize.active = loosen(trial, bad, I.k);
+    optimize.active = loosen(trial, bad, I.k);
     if (!valid) optimize.active.clear(), optimize.maxTangledSweeps = patientSweeps;
-    OptimizeReport after =
-        descends ? descendAround(trial, bad, optimize) : optimizeMesh(trial, optimize);
+    OptimizeReport after = optimizeMesh(trial, optimize);
+    bool better =
+        valid ? after.inverted == 0 && after.minQ > best.minQ : after.inverted < best.inverted;
+    if (!valid && !better && I.options.optimize.globalDescent) {
+      trial = M;
+      after = descendAround(trial, bad, optimize);
+      better = after.minQ >= leastDescended;
+    }
     after.sweeps += best.sweeps;
     after.visits += best.visits;
-    const bool better =
-        valid ? after.inverted == 0 && after.minQ > best.minQ
-              : after.inverted < best.inverted && (!descends || after.minQ >= leastDescended);
-    if (better)
-      M = std::move(trial), best = after;
-    else if (valid ? ++factor == std::end(factors) : descends || !mayDescend)
-      return;
-    descends = !valid && !better;
+    if (!better && (!valid || ++factor == std::end(factors))) return;
+    if (better) M = std::move(trial), best = after;
   }
 }
 
@@ -7291,8 +7292,10 @@ constexpr double badHausdorff = .45;  // [choice] of l_c: refused
 /// more.
 constexpr double betterBy = .01;
 
-/// What the lowest q of a way counts.
-double countedQuality(double lowest, const InsertReport& report) {
+/// What the lowest q of a way counts; beside earlier surfaces, of which it may be on every way, the
+/// lowest near S.
+double countedQuality(const Insertion& I, const Mesh& M, const InsertReport& report) {
+  const double lowest = I.k > 1 ? lowestNear(M, I.k) : report.smoothed.min;
   return report.hausdorff > poorHausdorff * report.lc ? poorWorth * lowest : lowest;
 }
 
@@ -7386,11 +7389,9 @@ void refineFarFaces(const Insertion& I, Mesh& M, InsertReport& report) {
     I.progress("3.7 refined where S_M is far from S: " + number(after.hausdorff / lc) + " l_c, " +
                std::to_string(trial.tets.size()) + " tetrahedra, min " +
                number(after.smoothed.min));
-    const bool enough = report.hausdorff <= badHausdorff * lc;  // then q may not fall for it
+    const bool enough = report.hausdorff <= badHausdorff * lc;  // then what q counts may not fall
     if (after.hausdorff >= report.hausdorff) return;
-    if (enough && countedQuality(after.smoothed.min, after) <
-                      countedQuality(report.smoothed.min, report) - betterBy)
-      return;
+    if (enough && countedQuality(I, trial, after) < countedQuality(I, M, report) - betterBy) return;
     after.optimization.sweeps += report.optimization.sweeps;
     after.optimization.visits += report.optimization.visits;
     M = std::move(trial), report = after;
@@ -7419,9 +7420,7 @@ bool tryWay(Insertion& I, const Way& way, bool patient, Mesh& result, InsertRepo
     I.leave(describe(way), error);
     return true;
   }
-  // beside earlier surfaces the lowest q may be theirs, on every way
-  const double lowest =
-      countedQuality(I.k > 1 ? lowestNear(trial, I.k) : ofThisWay.smoothed.min, ofThisWay);
+  const double lowest = countedQuality(I, trial, ofThisWay);
   const double worth = lowest + ofThisWay.smoothed.mean;
   if (report.surface == 0 || worth > I.worth + betterBy)
     report = ofThisWay, result = std::move(trial), I.lowest = lowest, I.worth = worth;

@@ -218,7 +218,7 @@ struct QualityStatistics {
 
 /// One sweep of Algorithm 2, for a progress display: of the elements that may change.
 struct Sweep {
-  int number, inverted;
+  int number, inverted;  // a valid mesh may pass inverted ones, to cure flat elements
   double minQ, disp;
 };
 
@@ -293,7 +293,7 @@ struct InsertOptions {
   Outline outline = Outline::halfSquares;  // [§3.5 departure]
   bool followRim = true;     // [§3.6 departure] rim correspondence and anchored equations
   int maxTets = 20000000;    // refuse where more tetrahedra are predicted
-  OptimizeOptions optimize;  // §3.7; its active and globalDescent are set by the insertion
+  OptimizeOptions optimize;  // §3.7; its active is set by the insertion
   // Called after each stage with the mesh as it is then: "approximated" (3.2) and "healed"
   // (3.3) for each course of S_M, through the middle or along a side of 𝓣, and in it for each way
   // that is tried "extracted" (3.4), "surfaceHealed" (3.5), "projected" (3.6); and at the end
@@ -1051,7 +1051,8 @@ WolfeStep strongWolfe(const std::function<LinePoint(double t)>& F, double tFirst
 /// elements are regular, without M.dimension the boundary is fixed. Indices and entities keep; M.x
 /// and M.parameter change. A node of more than 20000 elements stays.
 ///   errors  InputError: options out of range, a malformed mesh.
-///           No exception for an unfinished optimization: see the report.
+///           No exception for an unfinished optimization: see the report. Where a callback throws
+///           M is left as it is then.
 OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options = {});
 
 /// [§4, Table I] Statistics of q against the computational elements, or against the regular

@@ -1923,20 +1923,19 @@ Validity validity(Smoother& S, bool wakes) {
   return sumOfPieces<Validity>(S.crew, 0, static_cast<int>(S.elements.size()), piece, ofPiece);
 }
 
-/// μ of the sweep: the next rung where the number of inverted elements does not fall.
+/// μ of the sweep: the next rung where the number of inverted, or flat, elements does not fall.
 struct MuSchedule {
   int rung = 0, fewest = std::numeric_limits<int>::max(), waited = 0, tangledSweeps = 0;
   int atFirst = 0;
 
-  bool isHopeless(int inverted) const {
-    return tangledSweeps == hopelessSweeps && inverted > hopelessCount &&
-           inverted > hopelessPart * atFirst;
+  bool isHopeless(int bad) const {
+    return tangledSweeps == hopelessSweeps && bad > hopelessCount && bad > hopelessPart * atFirst;
   }
-  double next(double mu, int inverted) {
-    if (++tangledSweeps == 1) atFirst = inverted;
-    if (inverted >= fewest && ++waited < sweepsWithoutProgress) return mu * muLadder[rung];
-    if (inverted >= fewest) rung = (rung + 1) % 3;
-    fewest = inverted;
+  double next(double mu, int bad) {
+    if (++tangledSweeps == 1) atFirst = bad;
+    if (bad >= fewest && ++waited < sweepsWithoutProgress) return mu * muLadder[rung];
+    if (bad >= fewest) rung = (rung + 1) % 3;
+    fewest = bad;
     waited = 0;
     return mu * muLadder[rung];
   }
@@ -1947,6 +1946,11 @@ struct Positions {
   std::vector<Vec3> x;
   std::vector<Vec2> parameter;
 };
+
+void takeBack(Smoother& S, Positions& places) {
+  S.M.x = std::move(places.x), S.M.parameter = std::move(places.parameter);
+  places = {};
+}
 
 /// [§3.7.4, Algorithm 2] optimizeMesh's loop. While elements are inverted δ comes from the σ_min of
 /// all elements that may change and holds for all nodes; afterwards it is 0, and a move that would
@@ -1959,26 +1963,32 @@ bool sweepUntilSettled(Smoother& S, Positions& lastValid) {
   const double wake = std::max(wakeFraction * S.options.maxDisp, settled);
   const OptimizeOptions& o = S.options;
   const bool wakesLess = o.acceleration > 0 && o.active.empty() && !o.starDelta;
-  const int flatUntil = o.starDelta ? 0 : std::min(flatSweeps, o.maxTangledSweeps);
+  int flatUntil = o.starDelta ? 0 : std::min(flatSweeps, o.maxTangledSweeps);
   Anderson acceleration(S);
   while (sweepsLeft(S)) {
     S.flat = tangled && S.report.sweeps < flatUntil;
     const Validity v = tangled ? validity(S, wakesLess) : Validity{0, 0, 1};
-    tangled = v.inverted + v.flat > 0;
+    const int bad = v.inverted + v.flat;
+    tangled = bad > 0;
     if (tangled && v.inverted == 0) lastValid = {S.M.x, S.M.parameter};
-    if (tangled && !S.options.globalDescent && schedule.isHopeless(v.inverted)) return false;
-    if (tangled && schedule.tangledSweeps >= S.options.maxTangledSweeps) {
-      if (!S.options.globalDescent) return false;
-      globalDescent(S);
-      schedule = {};
+    if (tangled && (schedule.tangledSweeps >= o.maxTangledSweeps ||
+                    (!o.globalDescent && schedule.isHopeless(bad)))) {
+      if (!lastValid.x.empty()) {  // what flat elements cost is taken back; on without them
+        takeBack(S, lastValid);
+        flatUntil = 0;
+      } else if (o.globalDescent) {
+        globalDescent(S);
+        schedule = {};
+      } else {
+        return false;
+      }
       for (int n : S.order) wakeNode(S, n);
       continue;
     }
     if (wakesLess && S.tangled && !tangled)
       for (int n : S.order) wakeNode(S, n);
     S.wake = tangled && wakesLess ? tangledWake : wake;
-    S.delta =
-        tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, v.inverted + v.flat)) : 0;
+    S.delta = tangled ? chooseDelta(v.sigmaMin, schedule.next(S.options.mu, bad)) : 0;
     S.tangled = tangled;
     S.stuck = tangled && schedule.tangledSweeps > easySweeps;
     S.rung = schedule.rung;
@@ -1997,8 +2007,7 @@ bool sweepUntilSettled(Smoother& S, Positions& lastValid) {
 bool untangleAndSmooth(Smoother& S) {
   Positions lastValid;
   const bool converged = sweepUntilSettled(S, lastValid);
-  if (!converged && !lastValid.x.empty() && validity(S, false).inverted > 0)
-    S.M.x = lastValid.x, S.M.parameter = lastValid.parameter;
+  if (!converged && !lastValid.x.empty() && validity(S, false).inverted > 0) takeBack(S, lastValid);
   return converged;
 }
 

@@ -328,6 +328,36 @@ TEST_SUITE("3.2") {
           }
   }
 
+  TEST_CASE("of equally near triangles the lowest one, far from the origin too") {
+    const std::vector<Vec3> random = scatteredPoints(400);
+    for (double width : {1., 1e-2, 1e-4})
+      for (double apart : {1e-9, 1e-8, 1e-7})
+        for (std::size_t i = 0; i + 4 < random.size(); i += 4) {
+          // some 10 m large; rounding tells the copies apart or not
+          const Vec3 a = Vec3{4e6, 2.8e6, 1.2e6} + 10 * random[i];
+          const Vec3 along = 10 * random[i + 1], across = width * random[i + 2];
+          std::vector<Vec3> points;
+          std::vector<std::array<int, 3>> triangles;
+          for (int k = 0; k < 6; ++k) {
+            for (const Vec3& p : {a, a + along, a + .5 * along + across})
+              points.push_back(p + ((5 - k) * apart) * random[i + 3]);
+            triangles.push_back({3 * k, 3 * k + 1, 3 * k + 2});
+          }
+          const TriangleTree tree(points, triangles);
+          for (const std::array<int, 3>& t : triangles) {
+            const Vec3 x = .5 * points[t[0]] + .3 * points[t[1]] + .2 * points[t[2]];
+            ClosestPoint least{1e300, x, -1, {0, 0, 0}, Feature::face, 0};
+            for (int k = 0; k < 6; ++k) {
+              const ClosestPoint p =
+                  closestPointOnTriangle(x, points[3 * k], points[3 * k + 1], points[3 * k + 2]);
+              if (p.distance < least.distance) least = p, least.triangle = k;
+            }
+            CHECK(tree.closest(x).distance == least.distance);
+            CHECK(tree.closest(x).triangle == least.triangle);
+          }
+        }
+  }
+
   TEST_CASE("the nearest point of a triangle is that of a search, for needles too") {
     for (double height : {.7, 1e-3, 1e-9}) {
       CAPTURE(height);

@@ -10,6 +10,7 @@
 #include <thread>
 #include <vector>
 
+#include "../samples/surfaces.hpp"
 #include "shapes.hpp"
 
 using namespace meccano;
@@ -60,6 +61,43 @@ Mesh cubeWithFlatElements(Vec3 place, std::vector<int>& fixed) {
   }
   M.x[fixed[0]] = place + valid * out;
   return M;
+}
+
+/// Adds, beside the mesh, the star of a cube's middle with its other nodes moved at random as far
+/// as the middle still finds a place: hardly any, so that some elements are as good as flat.
+void addNarrowStar(Mesh& M, double scale) {
+  Mesh star = shakenCube(2, 0);
+  int middle = 0;
+  while (!(star.x[middle] == Vec3{.5, .5, .5})) ++middle;
+  const auto isElsewhere = [&](const std::array<int, 4>& z) {
+    return std::find(z.begin(), z.end(), middle) == z.end();
+  };
+  star.tets.erase(std::remove_if(star.tets.begin(), star.tets.end(), isElsewhere), star.tets.end());
+  samples::Random random(1);
+  std::vector<Vec3> move(star.x.size());
+  for (Vec3& d : move)
+    for (double Vec3::*c : {&Vec3::x, &Vec3::y, &Vec3::z}) d.*c = random.between(-1, 1);
+  OptimizeOptions options;
+  options.globalDescent = false;
+  Mesh last = star;
+  double valid = 0, inverted = 1;
+  for (int halving = 0; halving < 50; ++halving) {
+    const double far = .5 * (valid + inverted);
+    Mesh trial = star;
+    for (std::size_t n = 0; n < move.size(); ++n) trial.x[n] += far * move[n];
+    trial.x[middle] = last.x[middle];
+    if (shapes::countInverted(trial) > 0) optimizeMesh(trial, options);
+    const bool isValid = shapes::countInverted(trial) == 0;
+    if (isValid) last = trial;
+    (isValid ? valid : inverted) = far;
+  }
+  const int first = static_cast<int>(M.x.size());
+  for (const Vec3& x : last.x) M.x.push_back(scale * x + Vec3{5, 0, 0});
+  for (const Vec3& xi : star.xi) M.xi.push_back(xi + Vec3{50, 0, 0});
+  for (std::array<int, 4> z : last.tets) {
+    for (int& n : z) n += first;
+    M.tets.push_back(z);
+  }
 }
 
 /// An inner block of a Kuhn cube turned about a skew axis; the block's nodes are to be fixed.
@@ -286,12 +324,29 @@ TEST_SUITE("3.7.4") {
     }
   }
 
+  TEST_CASE("Algorithm 2: choice, a flat star that cannot be cured does not hold up the others") {
+    for (bool globalDescent : {true, false}) {
+      OptimizeOptions options;
+      options.globalDescent = globalDescent;
+      Mesh M = shakenCube(6, .25);
+      const std::size_t cube = M.tets.size();
+      addNarrowStar(M, 1. / 3);
+      REQUIRE(shapes::countInverted(M) == 0);
+      REQUIRE(qualityStatistics(M).min < 1e-5);
+      CHECK(optimizeMesh(M, options).converged);
+      CHECK(shapes::countInverted(M) == 0);
+      const std::vector<double> q = qualities(M);
+      CHECK(*std::min_element(q.begin(), q.begin() + static_cast<std::ptrdiff_t>(cube)) > .9);
+    }
+  }
+
   TEST_CASE("Algorithm 2: choice, flat elements without a free node do not hold up the others") {
     for (bool globalDescent : {true, false}) {
       OptimizeOptions options;
       Mesh M = cubeWithFlatElements({.25, .75, .5}, options.fixed);
+      const std::vector<double> q = qualities(M);
       for (std::size_t E = 0; E < M.tets.size(); ++E)
-        if (qualities(M)[E] < 1e-4)
+        if (q[E] < 1e-4)
           options.fixed.insert(options.fixed.end(), M.tets[E].begin(), M.tets[E].end());
       options.maxTangledSweeps = 12, options.globalDescent = globalDescent;
       const OptimizeReport report = optimizeMesh(M, options);
