@@ -1869,8 +1869,9 @@ constexpr int sweepsWithoutProgress = 3;       // that μ is given before the ne
 constexpr double muLadder[3] = {2.5, 1, .25};  // of options.mu, in turn while the mesh is tangled
 
 /// [choice] Where no descent may follow, a tangled mesh is given up after so many sweeps if more
-/// than a tenth of its inverted elements, and not just a few, are left. Measured on projected
-/// surfaces: below 1 % in what becomes valid; above 30 %, even after 60 sweeps, in what does not.
+/// than a tenth of its inverted or flat elements, and not just a few, are left. Measured on
+/// projected surfaces: below 1 % in what becomes valid; above 30 %, even after 60 sweeps, in what
+/// does not.
 constexpr int hopelessSweeps = 10, hopelessCount = 60;
 constexpr double hopelessPart = .1;
 
@@ -1955,7 +1956,8 @@ void takeBack(Smoother& S, Positions& places) {
 /// [§3.7.4, Algorithm 2] optimizeMesh's loop. While elements are inverted δ comes from the σ_min of
 /// all elements that may change and holds for all nodes; afterwards it is 0, and a move that would
 /// invert an element has f = ∞. Keeps the last places where a mesh with a δ, for elements that are
-/// as good as flat, is valid. Returns whether it converged on a valid mesh.
+/// as good as flat, is valid, and goes on from there rather than give up. Returns whether it
+/// converged on a valid mesh.
 bool sweepUntilSettled(Smoother& S, Positions& lastValid) {
   MuSchedule schedule;
   bool tangled = true;
