@@ -609,7 +609,14 @@ struct MeccanoSurface {
   }
   LatticePoint start(int h) const { return chains[h / 2].end[h % 2]; }
   int startNode(int h) const { return chains[h / 2].node[h % 2]; }
-  int rectangleLeftOf(int h) const;
+  /// The lattice point after its start.
+  LatticePoint second(int h) const {
+    const LatticePoint &a = start(h), &b = start(h ^ 1);
+    LatticePoint p;
+    for (int i = 0; i < 3; ++i) p[i] = a[i] + (b[i] > a[i]) - (b[i] < a[i]);
+    return p;
+  }
+  int rectangleLeftOf(int h) const { return squares[squareLeftOf(start(h), second(h))].rectangle; }
 
  private:
   using UnitEdges = std::set<std::pair<LatticePoint, LatticePoint>>;  // in both directions
@@ -790,20 +797,8 @@ void MeccanoSurface::addChains() {
   around.resize(nodes.size());
   for (int n = 0; n < static_cast<int>(nodes.size()); ++n)
     for (const LatticePoint& q : spokes(nodes[n]))
-      for (int h = 0; h < static_cast<int>(2 * chains.size()); ++h) {
-        const LatticePoint &a = start(h), &b = start(h ^ 1);
-        if (a != nodes[n]) continue;
-        LatticePoint step;
-        for (int i = 0; i < 3; ++i) step[i] = a[i] + (b[i] > a[i]) - (b[i] < a[i]);
-        if (step == q) around[n].push_back(h);
-      }
-}
-
-int MeccanoSurface::rectangleLeftOf(int h) const {
-  const LatticePoint &a = start(h), &b = start(h ^ 1);
-  LatticePoint q;
-  for (int i = 0; i < 3; ++i) q[i] = a[i] + (b[i] > a[i]) - (b[i] < a[i]);
-  return squares[squareLeftOf(a, q)].rectangle;
+      for (int h = 0; h < static_cast<int>(2 * chains.size()); ++h)
+        if (start(h) == nodes[n] && second(h) == q) around[n].push_back(h);
 }
 
 /// Around each rectangle: after half-chain h comes the one before its reverse, seen around the
@@ -1257,6 +1252,21 @@ Disk diskAt(const CutSolid& D, int t) {
   return P;
 }
 
+/// The points next to point n.
+std::vector<int> pointsAround(const CutSolid& D, int n) {
+  std::vector<int> around;
+  D.aroundPoint(n, [&](int t, int i) { around.push_back(D.triangles[t][(i + 1) % 3]); });
+  return around;
+}
+
+/// Arc length at each point of a path.
+std::vector<double> arcLengths(const CutSolid& D, const std::vector<int>& path) {
+  std::vector<double> s{0};
+  for (std::size_t k = 1; k < path.size(); ++k)
+    s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
+  return s;
+}
+
 /// A triangle to the left of the path of half-chain h.
 int triangleLeftOf(const CutSolid& D, int h) {
   const std::vector<int>& path = D.path[h / 2];
@@ -1646,14 +1656,8 @@ void placeCutEnds(const MeccanoSurface& B, CutSolid& D) {
     }
     if (run.size() < 2) continue;
     const int A = D.node[B.startNode(h)], Z = D.node[B.startNode(run.back() ^ 1)];
-    std::vector<int> first;
-    D.aroundPoint(A, [&](int t, int i) { first.push_back(D.triangles[t][(i + 1) % 3]); });
-    std::vector<int> last;
-    D.aroundPoint(Z, [&](int t, int i) { last.push_back(D.triangles[t][(i + 1) % 3]); });
-    const std::vector<int> path = shortestPath(D, A, Z, first, last, {});
-    std::vector<double> s{0};
-    for (std::size_t k = 1; k < path.size(); ++k)
-      s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
+    const std::vector<int> path = shortestPath(D, A, Z, pointsAround(D, A), pointsAround(D, Z), {});
+    const std::vector<double> s = arcLengths(D, path);
     if (path.size() < run.size() + 1)
       throw MethodError("getBoundaryMapping (§2): the solid's surface is too coarse between " +
                         placeText(D.points[A]) + " and " + placeText(D.points[Z]) +
@@ -1759,9 +1763,7 @@ void addCurves(const MeccanoSurface& B, const CutSolid& D, BoundaryMapping& Pi) 
     int last = h;
     for (int g = h; g >= 0; last = g, g = straightOn(B, g)) {
       const std::vector<int>& path = D.path[g / 2];
-      std::vector<double> s{0};
-      for (std::size_t k = 1; k < path.size(); ++k)
-        s.push_back(s.back() + norm(D.points[path[k]] - D.points[path[k - 1]]));
+      const std::vector<double> s = arcLengths(D, path);
       for (std::size_t k = 0; k + 1 < path.size(); ++k) add(path[k], g, s[k] / s.back());
     }
     add(D.node[B.startNode(last ^ 1)], last ^ 1, 0);
@@ -5734,10 +5736,10 @@ TriangleTree treeOf(const Mesh& M, const SquareSurface& Q, const Selection& sele
 double uncovered(const TriangleTree& tree, double h, const SurfaceDistance& S) {
   constexpr double weight = 5000, allowed = 1.1;
   double sum = 0, area = 0;
-  for (const std::array<int, 3>& t : S.S.triangles) {
-    const Vec3 a = S.S.points[t[0]], b = S.S.points[t[1]], c = S.S.points[t[2]];
-    const Vec3 middle = (1. / 3) * (a + b + c);
-    const double part = .5 * norm(cross(b - a, c - a));
+  for (int t = 0; t < static_cast<int>(S.S.triangles.size()); ++t) {
+    const std::array<Vec3, 3> c = cornersOf(S.S, t);
+    const Vec3 middle = (1. / 3) * (c[0] + c[1] + c[2]);
+    const double part = areaOf(S.S, t);
     area += part;
     if (triangleWithin(tree, middle, allowed * h) >= 0) continue;
     const double far = tree.closest(middle).distance / h - allowed;
