@@ -2335,45 +2335,12 @@ void forQualities(const Mesh& M, Ideal ideal, std::size_t count, const Element& 
   }
 }
 
-template <class Use>
-void forQualities(const Mesh& M, Ideal ideal, const Use& use) {
-  const auto each = [](std::size_t E) { return static_cast<int>(E); };
-  forQualities(M, ideal, M.tets.size(), each, use);
-}
-
-/// Table I's row, of one q after the other.
-class Statistics {
- public:
-  void add(double q) {
-    const int last = static_cast<int>(table_.histogram.size()) - 1;
-    if (q == 0) ++table_.inverted;
-    if (table_.tetrahedra++ == 0 || q < table_.min) table_.min = q;
-    table_.max = std::max(table_.max, q);
-    table_.mean += q;
-    squares_ += (1 - q) * (1 - q);
-    ++table_.histogram[std::clamp(static_cast<int>(20 * q), 0, last)];
-  }
-  QualityStatistics table() const {
-    QualityStatistics table = table_;
-    if (table.tetrahedra == 0) return table;
-    const double count = table.tetrahedra;
-    table.mean /= count;
-    // in one pass, from 1: rounding leaves some 1e-8 where all q are equal
-    const double fromMean = squares_ / count - (1 - table.mean) * (1 - table.mean);
-    table.stdDev = std::sqrt(std::max(0., fromMean));
-    return table;
-  }
-
- private:
-  QualityStatistics table_;
-  double squares_ = 0;
-};
-
 }  // namespace
 
 std::vector<double> qualities(const Mesh& M, Ideal ideal) {
   std::vector<double> all(M.tets.size());
-  forQualities(M, ideal, [&all](int E, double q) { all[E] = q; });
+  const auto each = [](std::size_t E) { return static_cast<int>(E); };
+  forQualities(M, ideal, all.size(), each, [&all](int E, double q) { all[E] = q; });
   return all;
 }
 
@@ -2396,15 +2363,25 @@ std::vector<double> qualities(const Mesh& M, const std::vector<Vec3>& before,
 }
 
 QualityStatistics qualityStatistics(const std::vector<double>& all) {
-  Statistics statistics;
-  for (double q : all) statistics.add(q);
-  return statistics.table();
+  QualityStatistics table;
+  if (all.empty()) return table;
+  const int last = static_cast<int>(table.histogram.size()) - 1;
+  const double count = static_cast<double>(all.size());
+  table.tetrahedra = static_cast<int>(all.size());
+  table.min = *std::min_element(all.begin(), all.end());
+  table.max = *std::max_element(all.begin(), all.end());
+  table.mean = std::accumulate(all.begin(), all.end(), 0.) / count;
+  for (double q : all) {
+    if (q == 0) ++table.inverted;
+    table.stdDev += (q - table.mean) * (q - table.mean) / count;
+    ++table.histogram[std::clamp(static_cast<int>((last + 1) * q), 0, last)];
+  }
+  table.stdDev = std::sqrt(table.stdDev);
+  return table;
 }
 
 QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal) {
-  Statistics statistics;
-  forQualities(M, ideal, [&](int, double q) { statistics.add(q); });
-  return statistics.table();
+  return qualityStatistics(qualities(M, ideal));
 }
 
 }  // namespace meccano
