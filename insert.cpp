@@ -6871,7 +6871,6 @@ InsertOptions InsertOptions::paper() {
   options.outline = Outline::paper;
   options.followRim = false;
   options.optimize = OptimizeOptions::paper();
-  options.optimize.globalDescent = false;
   return options;
 }
 

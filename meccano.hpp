@@ -255,7 +255,8 @@ struct OptimizeOptions {
   std::function<bool(int n, Vec3 x, Vec2 parameter)> accept = nullptr;
   std::function<void(const Sweep&)> onSweep = nullptr;  // called after each sweep
 
-  static OptimizeOptions paper();  // Algorithm 2 to the letter: Σ η alone, numerical derivatives
+  // Algorithm 2 to the letter: Σ η alone, numerical derivatives, node by node only
+  static OptimizeOptions paper();
 };
 
 struct OptimizeReport {

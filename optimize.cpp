@@ -2249,6 +2249,7 @@ OptimizeOptions OptimizeOptions::paper() {
   options.numericalDerivatives = options.strongWolfe = true;
   options.relaxation = 1;
   options.acceleration = 0;
+  options.globalDescent = false;
   return options;
 }
 

@@ -191,8 +191,9 @@ TEST_SUITE("2") {
     };
     CHECK(contains(box({0, 0, 0}, {1, 1, 1}, {2, 0, 2}), "number of cells"));
     CHECK(contains(box({0, 0, 0}, {1, 1, 1}, {2, 2, -1}), "number of cells"));
-    CHECK(contains(box({0, 0, 0}, {1, 0, 1}, {2, 2, 2}), "size"));
-    CHECK(contains(box({0, 0, 0}, {1, 1, -3}, {2, 2, 2}), "size"));
+    for (double bad : {0., -3.})
+      for (Vec3 size : {Vec3{bad, 1, 1}, Vec3{1, bad, 1}, Vec3{1, 1, bad}})
+        CHECK(contains(box({0, 0, 0}, size, {2, 2, 2}), "size"));
     CHECK(contains(box({0, nan, 0}, {1, 1, 1}, {2, 2, 2}), "origin"));
     CHECK(contains(box({0, 0, 0}, {1, 1, nan}, {2, 2, 2}), "size"));
     CHECK(contains(box({0, 0, 0}, {infinite, 1, 1}, {2, 2, 2}), "finite"));

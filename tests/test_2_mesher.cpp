@@ -350,6 +350,10 @@ TEST_SUITE("2") {
     CHECK(heightAt(T, 300 + 50 * 3, -200 + 50 * 4) == doctest::Approx(T.z[4 * 24 + 3]));
     const double middle = .25 * (T.z[0] + T.z[1] + T.z[24] + T.z[25]);
     CHECK(heightAt(T, 325, -175) == doctest::Approx(middle));
+    const Vec2 far{300 + 50. * (T.nx - 1), -200 + 50. * (T.ny - 1)};
+    CHECK(heightAt(T, far.x, far.y) == T.z.back());
+    CHECK(heightAt(T, far.x + 70, far.y + 90) == T.z.back());  // outside: as on the border
+    CHECK(heightAt(T, 0, -900) == T.z.front());
     T.cells = {0, 0, 0};
     const std::array<int, 3> n = terrainCells(T);
     const double hx = 1150. / n[0], hy = 950. / n[1];

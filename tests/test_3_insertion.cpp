@@ -229,6 +229,35 @@ TEST_SUITE("3") {
     CHECK(report.hausdorff <= .1 * .12);
   }
 
+  TEST_CASE("insertion: to the letter is without any departure that an option names") {
+    const InsertOptions options = InsertOptions::paper();
+    CHECK(options.outline == Outline::paper);
+    CHECK_FALSE(options.followRim);
+    const OptimizeOptions& o = options.optimize;
+    CHECK(o.power == 1);
+    CHECK(o.numericalDerivatives);
+    CHECK(o.strongWolfe);
+    CHECK(o.relaxation == 1);
+    CHECK(o.acceleration == 0);
+    CHECK_FALSE(o.globalDescent);
+  }
+
+  TEST_CASE("optimization: the lift raises the lowest q by .14 and takes .006 of the mean") {
+    double gain = 0, loss = 0;  // the last sweeps win .0026 of the mean back
+    constexpr int seeds[] = {3, 4, 5, 6};
+    for (int seed : seeds)
+      for (double power : {64., 1.}) {
+        InsertOptions options = withSize(.12);
+        options.optimize.power = power;
+        Mesh M = unitBox();
+        const QualityStatistics q = insertSurface(M, samples::randomPatch(seed), options).smoothed;
+        gain += (power > 1 ? .25 : -.25) * q.min;
+        loss += (power > 1 ? -.25 : .25) * q.mean;
+      }
+    CHECK(gain > .14);
+    CHECK(loss < .007);
+  }
+
   TEST_CASE("insertion: the same bytes in two runs") {
     for (const InsertOptions& options : {InsertOptions(), InsertOptions::paper()}) {
       Mesh A = unitBox(), B = unitBox();

@@ -103,6 +103,19 @@ TEST_SUITE("Table I") {
     CHECK(table.histogram == histogram);
   }
 
+  TEST_CASE("Table I: of a list of q, those of 0 are inverted, 1 counts in the last bar") {
+    const QualityStatistics table = qualityStatistics(std::vector<double>{1, .95, .5, 0, .049});
+    CHECK(table.tetrahedra == 5);
+    CHECK(table.inverted == 1);
+    CHECK(table.min == 0);
+    CHECK(table.max == 1);
+    std::array<int, 20> histogram{};
+    histogram[0] = histogram[19] = 2, histogram[10] = 1;
+    CHECK(table.histogram == histogram);
+    CHECK(qualityStatistics(std::vector<double>{}).tetrahedra == 0);
+    CHECK(qualityStatistics(std::vector<double>(7, .6)).stdDev == doctest::Approx(0));
+  }
+
   TEST_CASE(
       "Table I: without computational coordinates the ideal is regular, in either orientation") {
     Mesh M = shapes::twoTetrahedra();
