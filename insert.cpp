@@ -3855,7 +3855,7 @@ namespace {
 
 constexpr double beyondAll = 1e300;  // beyond every coordinate; its square is infinite
 constexpr int queryPiece = 512;      // queries of a task for one thread: some 300 μs
-constexpr int trianglesPerLeaf = 4;
+constexpr int trianglesPerLeaf = 2;
 /// Whether a box is farther than the bound, by more than rounding; a negative bound: always.
 bool isFarther(double distance2, double bound) {
   constexpr double rounding = 2e-12;  // relative, of squared distances
@@ -3892,13 +3892,15 @@ struct Centre {
 };
 
 /// Recursive median split of centres[first, last) along the longest side of their box.
-void buildTreeNode(TriangleTree& tree, const std::vector<std::array<Vec3, 3>>& corners,
+void buildTreeNode(TriangleTree& tree, const std::vector<TriangleTree::Box>& boxes,
                    std::vector<Centre>& centres, int first, int last) {
   const int self = static_cast<int>(tree.nodes.size());
   if (last - first <= trianglesPerLeaf) {
-    TriangleTree::Box box = boxOf(corners[centres[first].triangle]);
-    for (int i = first; i < last; ++i)
-      for (Vec3 p : corners[centres[i].triangle]) growBox(box, p);
+    TriangleTree::Box box = boxes[centres[first].triangle];
+    for (int i = first; i < last; ++i) {
+      growBox(box, boxes[centres[i].triangle].lo);
+      growBox(box, boxes[centres[i].triangle].hi);
+    }
     tree.nodes.push_back({box, first, last - first, -1});
     return;
   }
@@ -3913,9 +3915,9 @@ void buildTreeNode(TriangleTree& tree, const std::vector<std::array<Vec3, 3>>& c
                             std::make_pair(b.at.*axis, b.triangle);
                    });
   tree.nodes.push_back({});
-  buildTreeNode(tree, corners, centres, first, half);
+  buildTreeNode(tree, boxes, centres, first, half);
   const int right = static_cast<int>(tree.nodes.size());
-  buildTreeNode(tree, corners, centres, half, last);
+  buildTreeNode(tree, boxes, centres, half, last);
   TriangleTree::Box box = tree.nodes[self + 1].box;
   growBox(box, tree.nodes[right].box.lo);
   growBox(box, tree.nodes[right].box.hi);
@@ -3970,84 +3972,80 @@ ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c) {
   return best;
 }
 
-TriangleTree::TriangleTree(const std::vector<Vec3>& x,
-                           const std::vector<std::array<int, 3>>& triangles) {
-  std::vector<std::array<Vec3, 3>> all;
+TriangleTree::TriangleTree(const std::vector<Vec3>& x, const std::vector<std::array<int, 3>>& all) {
+  const auto cornersAt = [&](int t) {
+    return std::array<Vec3, 3>{x[all[t][0]], x[all[t][1]], x[all[t][2]]};
+  };
+  const int count = static_cast<int>(all.size());
+  std::vector<Box> boxes;
   std::vector<Centre> centres;
-  for (const std::array<int, 3>& t : triangles) {
-    all.push_back({x[t[0]], x[t[1]], x[t[2]]});
-    const Box box = boxOf(all.back());
-    centres.push_back({.5 * (box.lo + box.hi), static_cast<int>(centres.size())});
+  for (int t = 0; t < count; ++t) {
+    boxes.push_back(boxOf(cornersAt(t)));
+    centres.push_back({.5 * (boxes[t].lo + boxes[t].hi), t});
   }
-  if (!all.empty()) buildTreeNode(*this, all, centres, 0, static_cast<int>(all.size()));
-  for (const Centre& centre : centres) {
-    triangle.push_back(centre.triangle);
-    corners.push_back(all[centre.triangle]), points.push_back(triangles[centre.triangle]);
-  }
+  if (count > 0) buildTreeNode(*this, boxes, centres, 0, count);
+  triangles.reserve(all.size());
+  for (const Centre& centre : centres)
+    triangles.emplace_back(centre.triangle, all[centre.triangle], cornersAt(centre.triangle));
 }
 
 namespace {
 
-/// Tells of points whether they are not farther than a distance from one triangle; without roots,
-/// and mostly without division. Of a needle, whose normal has few correct digits, by its nearest
-/// point.
-class NearTriangle {
- public:
-  explicit NearTriangle(const std::array<Vec3, 3>& corners)
-      : c_(corners),
-        edge_{c_[1] - c_[0], c_[2] - c_[1], c_[0] - c_[2]},
-        length2_{norm2(edge_[0]), norm2(edge_[1]), norm2(edge_[2])},
-        n_(cross(edge_[2], edge_[0])),
-        inward0_(cross(n_, edge_[0])),
-        inward2_(cross(n_, edge_[2])),
-        n2_(norm2(n_)),
-        needle_(!(n2_ > needleSine * needleSine * length2_[0] * length2_[2])) {}
-  bool operator()(Vec3 x, double distance) const {
-    constexpr double rounding = 1e-9;  // of n and what follows, with room
-    if (needle_) return closestPointOnTriangle(x, c_[0], c_[1], c_[2]).distance <= distance;
-    const Vec3 p = x - c_[0];
-    const double height = dot(p, n_), allowed2 = distance * distance * n2_;
-    // what the distance to the triangle's plane leaves in it, squared, times n2
-    const double beside2 = (1 + rounding) * allowed2 - height * height;
-    if (beside2 < 0) return false;
-    // the foot's barycentric coordinates, times n2: those that are 0 on edges 0, 1, 2
-    const double w0 = dot(p, inward0_), w2 = dot(p, inward2_);
-    const std::array<double, 3> w{w0, n2_ - w0 - w2, w2};
-    for (int k = 0; k < 3; ++k)
-      if (w[k] < 0 && w[k] * w[k] > beside2 * length2_[k]) return false;  // of the edge's line
-    if (w[0] > 0 && w[1] > 0 && w[2] > 0 && height * height <= allowed2) return true;
-    for (int k = 0; k < 3; ++k) {
-      const Vec3 q = x - c_[k];
-      const double along = dot(q, edge_[k]);
-      const double t = along <= 0 ? 0 : along >= length2_[k] ? 1 : along / length2_[k];
-      if (norm2(q - t * edge_[k]) <= distance * distance) return true;
-    }
-    return false;
-  }
-
- private:
-  static constexpr double needleSine = 1e-3;  // of the angle at corner 0
-  std::array<Vec3, 3> c_, edge_;
-  std::array<double, 3> length2_;
-  Vec3 n_, inward0_, inward2_;  // the edges' normals in the plane, of edges 0 and 2
-  double n2_;
-  bool needle_;
-};
+/// Of the angle at corner 0 of a needle.
+constexpr double needleSine = 1e-3;
 
 }  // namespace
+
+TreeTriangle::TreeTriangle(int inputNumber, const std::array<int, 3>& numbers,
+                           const std::array<Vec3, 3>& c)
+    : number(inputNumber),
+      points(numbers),
+      corners(c),
+      edge_{c[1] - c[0], c[2] - c[1], c[0] - c[2]},
+      length2_{norm2(edge_[0]), norm2(edge_[1]), norm2(edge_[2])},
+      n_(cross(edge_[2], edge_[0])),
+      inward0_(cross(n_, edge_[0])),
+      inward2_(cross(n_, edge_[2])),
+      n2_(norm2(n_)),
+      isNeedle_(!(n2_ > needleSine * needleSine * length2_[0] * length2_[2])) {}
+
+bool TreeTriangle::isWithin(Vec3 x, double distance) const {
+  constexpr double rounding = 1e-9;  // of n and what follows, with room
+  const std::array<Vec3, 3>& c = corners;
+  if (isNeedle_) return closestPointOnTriangle(x, c[0], c[1], c[2]).distance <= distance;
+  const Vec3 p = x - c[0];
+  const double height = dot(p, n_), allowed2 = distance * distance * n2_;
+  // what the distance to the triangle's plane leaves in it, squared, times n2_
+  const double beside2 = (1 + rounding) * allowed2 - height * height;
+  if (beside2 < 0) return false;
+  // the foot's barycentric coordinates, times n2_: those that are 0 on edges 0, 1, 2
+  const double w0 = dot(p, inward0_), w2 = dot(p, inward2_);
+  const std::array<double, 3> w{w0, n2_ - w0 - w2, w2};
+  for (int k = 0; k < 3; ++k)
+    if (w[k] < 0 && w[k] * w[k] > beside2 * length2_[k]) return false;  // of the edge's line
+  if (w[0] > 0 && w[1] > 0 && w[2] > 0 && height * height <= allowed2) return true;
+  for (int k = 0; k < 3; ++k) {
+    const Vec3 q = x - c[k];
+    const double along = dot(q, edge_[k]);
+    const double t = along <= 0 ? 0 : along >= length2_[k] ? 1 : along / length2_[k];
+    if (norm2(q - t * edge_[k]) <= distance * distance) return true;
+  }
+  return false;
+}
 
 ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   ClosestPoint best{within, x, -1, {0, 0, 0}, Feature::face, 0};
   if (nodes.empty()) return best;
-  // so much nearer NearTriangle sees for certain, and equal distances go to the lowest triangle
+  // so much nearer isWithin() sees for certain, and equal distances go to the lowest triangle
   constexpr double ofDistance = 1e-9, ofDiagonal = 1e-12, ofCoordinates = 1e-15;
   const Box& box = nodes[0].box;
   const double rounding =
       ofDiagonal * norm(box.hi - box.lo) + ofCoordinates * (norm(box.hi) + norm(box.lo));
   visitNearest(*this, 0, boxDistance2(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
-    if (!NearTriangle(corners[i])(x, (1 + ofDistance) * best.distance + rounding)) return;
-    ClosestPoint p = closestPointOnTriangle(x, corners[i][0], corners[i][1], corners[i][2]);
-    p.triangle = triangle[i];
+    if (!triangles[i].isWithin(x, (1 + ofDistance) * best.distance + rounding)) return;
+    const std::array<Vec3, 3>& c = triangles[i].corners;
+    ClosestPoint p = closestPointOnTriangle(x, c[0], c[1], c[2]);
+    p.triangle = triangles[i].number;
     const bool lower = p.distance == best.distance && p.triangle < best.triangle;
     if (p.distance < best.distance || lower) best = p;
   });
@@ -4207,7 +4205,7 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
   double bound = distance;  // −1 ends the search
   int found = -1;
   visitNearest(tree, 0, boxDistance2(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
-    if (found < 0 && NearTriangle(tree.corners[i])(x, distance)) found = i, bound = -1;
+    if (found < 0 && tree.triangles[i].isWithin(x, distance)) found = i, bound = -1;
   });
   return found;
 }
@@ -4218,13 +4216,12 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
 Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
                       Width largest, int from, int to) {
   constexpr double mostSteps = 1000;
-  // the triangles of B that were near last: neighbours in A are so to the same
-  const NearTriangle first(B.corners[0]);
-  std::array<NearTriangle, 4> recent{first, first, first, first};
+  std::array<int, 4> recent{};  // triangles of B that were near last: neighbours in A are so too
+  const auto isNear = [&](Vec3 p, int b) { return B.triangles[b].isWithin(p, largest.distance); };
   const auto isNearRecent = [&](Vec3 p) {
-    for (NearTriangle& isNear : recent)
-      if (isNear(p, largest.distance)) {
-        if (&isNear != &recent[0]) std::swap(isNear, recent[0]);
+    for (int& b : recent)
+      if (isNear(p, b)) {
+        std::swap(b, recent[0]);
         return true;
       }
     return false;
@@ -4234,17 +4231,17 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
     const int near = triangleWithin(B, p, largest.distance);
     if (near >= 0) {
       std::rotate(recent.begin(), recent.end() - 1, recent.end());
-      recent[0] = NearTriangle(B.corners[near]);
+      recent[0] = near;
     }
     return near >= 0;
   };
   KeyMap had(3 * (to - from) / 2);  // edge → steps of the lattice whose points on it were looked at
   for (int t = from; t < to; ++t) {
-    const std::array<Vec3, 3>& c = A.corners[t];
+    const std::array<Vec3, 3>& c = A.triangles[t].corners;
     // the distance from one triangle is a convex function: on another one largest at a corner
     findNear((1. / 3) * (c[0] + c[1] + c[2]));
-    const auto isNearOne = [&](Vec3 p) { return recent[0](p, largest.distance); };
-    if (isNearOne(c[0]) && isNearOne(c[1]) && isNearOne(c[2])) continue;
+    const int b = recent[0];
+    if (isNear(c[0], b) && isNear(c[1], b) && isNear(c[2], b)) continue;
     const double longest = std::max({norm(c[1] - c[0]), norm(c[2] - c[1]), norm(c[0] - c[2])});
     const int m = std::max(least, int(std::min(mostSteps, std::ceil(longest / spacing))));
     const auto look = [&](int i, int j) {
@@ -4255,7 +4252,7 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
       for (int j = 1; i + j < m; ++j) look(i, j);
     // of edge e from corner e on; those of the triangle beyond it are the same
     for (int e = 0; e < 3; ++e) {
-      int& steps = had[edgeKey(A.points[t][e], A.points[t][(e + 1) % 3])];
+      int& steps = had[edgeKey(A.triangles[t].points[e], A.triangles[t].points[(e + 1) % 3])];
       for (int i = steps >= m ? m + 1 : 0; i <= m; ++i)
         look(e == 0 ? i : e == 1 ? m - i : 0, e == 1 ? i : e == 2 ? m - i : 0);
       steps = std::max(steps, m);
@@ -4268,7 +4265,7 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
 Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
                       Width largest, const Crew& crew) {
   constexpr int few = 32;
-  const int count = static_cast<int>(A.corners.size());
+  const int count = static_cast<int>(A.triangles.size());
   const auto keepLarger = [&largest](const Width& other) {
     if (other.distance > largest.distance) largest = other;
   };
@@ -4295,8 +4292,8 @@ Gap gapWithin(const TriangleTree& tree, const std::vector<Vec3>& points,
     const double start = boxDistance2(tree.nodes[0].box, box);
     visitNearest(tree, 0, start, box, gap.distance, [&](int i) {
       Vec3 on;
-      const double d = trianglesDistance(tree.corners[i], other, on);
-      if (d < gap.distance) gap = {d, tree.triangle[i], static_cast<int>(o), on};
+      const double d = trianglesDistance(tree.triangles[i].corners, other, on);
+      if (d < gap.distance) gap = {d, tree.triangles[i].number, static_cast<int>(o), on};
     });
   }
   return gap;

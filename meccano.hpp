@@ -614,6 +614,25 @@ struct ClosestPoint {
 /// triangle competes with the nearest points of the edges. A segment is a triangle with c = b.
 ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c);
 
+/// A triangle of a tree, with what the test of nearness takes.
+struct TreeTriangle {
+  int number;                 // of the input
+  std::array<int, 3> points;  // numbers of the corners
+  std::array<Vec3, 3> corners;
+
+  TreeTriangle(int number, const std::array<int, 3>& points, const std::array<Vec3, 3>& corners);
+  /// Whether x is not farther than this; without roots, and mostly without division. Of a needle,
+  /// whose normal has few correct digits, by its nearest point.
+  bool isWithin(Vec3 x, double distance) const;
+
+ private:
+  std::array<Vec3, 3> edge_;
+  std::array<double, 3> length2_;  // of the edges, squared
+  Vec3 n_, inward0_, inward2_;     // normal, and those of edges 0 and 2 in the plane
+  double n2_;
+  bool isNeedle_;
+};
+
 /// Bounding boxes in a binary tree over triangles. Owns copies; building it is O(N log N).
 struct TriangleTree {
   struct Box {
@@ -624,10 +643,8 @@ struct TriangleTree {
     Box box;
     int first, count, right;
   };
-  std::vector<Node> nodes;                   // depth first
-  std::vector<int> triangle;                 // [triangles], input number, in tree order
-  std::vector<std::array<Vec3, 3>> corners;  // [triangles], in tree order
-  std::vector<std::array<int, 3>> points;    // [triangles], numbers of the corners
+  std::vector<Node> nodes;              // depth first
+  std::vector<TreeTriangle> triangles;  // in tree order
 
   TriangleTree() = default;
   TriangleTree(const std::vector<Vec3>& points, const std::vector<std::array<int, 3>>& triangles);
@@ -660,7 +677,7 @@ void TriangleTree::visit(Vec3 lo, Vec3 hi, Found found) const {
       stack[height++] = n + 1;
     }
     for (int i = node.first; i < node.first + node.count; ++i) {
-      if (boxesMeet(boxOf(corners[i]), lo, hi) && found(triangle[i])) return;
+      if (boxesMeet(boxOf(triangles[i].corners), lo, hi) && found(triangles[i].number)) return;
     }
   }
 }
