@@ -124,9 +124,9 @@ struct Parts {
   }
 };
 
-/// Corner of a triangle at point n: 0, 1, 2.
+/// Corner of a triangle at point n: 0, 1, 2; 3: it has none.
 int cornerAt(const std::array<int, 3>& triangle, int n) {
-  return static_cast<int>(std::find(triangle.begin(), triangle.end(), n) - triangle.begin());
+  return triangle[0] == n ? 0 : triangle[1] == n ? 1 : triangle[2] == n ? 2 : 3;
 }
 
 }  // namespace
@@ -2117,6 +2117,8 @@ std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
   return neighbour;
 }
 
+constexpr std::size_t usualStar = 32;  // elements: room that is seldom left
+
 Bisection::Bisection(Mesh& mesh) : Bisection(mesh, faceNeighbours(mesh)) {}
 
 Bisection::Bisection(Mesh& mesh, std::vector<std::array<int, 4>> known)
@@ -2126,6 +2128,7 @@ Bisection::Bisection(Mesh& mesh, std::vector<std::array<int, 4>> known)
 }
 
 void Bisection::ring(int E, int a, int b, std::vector<int>& around) const {
+  around.reserve(usualStar);
   around.assign(1, E);
   int others[2], found = 0;
   for (int n : M.tets[E])
@@ -2149,6 +2152,7 @@ template <class Wanted>
 int Bisection::walkStar(int n, std::vector<int>& around, const Wanted& wanted) const {
   walkedBy.resize(M.tets.size(), 0);
   ++walk;
+  around.reserve(usualStar);
   around.assign(1, tetOf[n]);
   walkedBy[tetOf[n]] = walk;
   for (std::size_t i = 0; i < around.size(); ++i) {
@@ -4216,7 +4220,7 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
 Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
                       Width largest, int from, int to) {
   constexpr double mostSteps = 1000;
-  std::array<int, 4> recent{};  // triangles of B that were near last: neighbours in A are so too
+  std::array<int, 8> recent{};  // triangles of B that were near last: neighbours in A are so too
   const auto isNear = [&](Vec3 p, int b) { return B.triangles[b].isWithin(p, largest.distance); };
   const auto isNearRecent = [&](Vec3 p) {
     for (int& b : recent)
@@ -4921,7 +4925,7 @@ void addCubesInCone(const Mesh& M, std::array<int, 4> z, int i, const Lattice& l
     const Vec3 toCentre{corner & 1 ? half : -half, corner & 2 ? half : -half,
                         corner & 4 ? half : -half};
     const Vec3 w = toEdges * toCentre;
-    if (std::min({w.x, w.y, w.z}) >= 0)
+    if (w.x >= 0 && w.y >= 0 && w.z >= 0)
       cubes.add(cornerOf(lattice.node(at), corner), x + images * w);
   }
 }
@@ -5340,10 +5344,12 @@ Survey surveySquares(const Mesh& M, const SquareSurface& Q, const SurfaceDistanc
       survey.facesUp[i] = s.facesAbove || (!s.facesBelow && S.query(s.beyond).side >= 0);
     survey.free[i] = true;
     for (int n : s.node) survey.free[i] &= M.dimension[n] == 3;
-    if (isDeep(s.centre)) return;
+    const bool onlyInHoles = Q.isMiddle && !survey.facesUp[i];  // which may be filled
+    if ((onlyInHoles && earlier.empty()) || isDeep(s.centre)) return;
     const SurfaceQuery middle = S.query(s.centre);
     survey.free[i] = survey.free[i] && !crossesAny(tree, M.x, earlier, s.centre, middle.point);
     survey.excess[i] = perH * middle.excess;
+    if (onlyInHoles) return;
     if (triangleWithin(S.rimTree, middle.point, deep * Q.h) < 0) return;
     for (int e = 0; e < 4; ++e) {
       const SurfaceQuery near =
