@@ -306,6 +306,19 @@ TEST_SUITE("3.2") {
     }
   }
 
+  TEST_CASE("a tree's triangle tells whether a point is within a distance, needles too") {
+    const std::vector<Vec3> random = scatteredPoints(400);
+    for (double width : {1., 1e-2, 1e-5, 1e-9, 0.})
+      for (std::size_t i = 0; i + 3 < random.size(); ++i) {
+        const Vec3 a = random[i], b = random[i + 1], c = b + width * (random[i + 2] - b);
+        const TriangleTree tree({a, b, c}, {{0, 1, 2}});
+        const Vec3 x = random[i + 3];
+        const double distance = closestPointOnTriangle(x, a, b, c).distance;
+        CHECK(tree.triangles[0].isWithin(x, distance * (1 + 1e-6)));
+        CHECK(!tree.triangles[0].isWithin(x, distance * (1 - 1e-6)));
+      }
+  }
+
   TEST_CASE("the nearer one of two needles") {  // of whose normals few digits are right
     const std::vector<Vec3> random = scatteredPoints(300);
     for (double width : {1e-3, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12})
@@ -322,8 +335,10 @@ TEST_SUITE("3.2") {
                                     {{first + turn, first + (turn + 1) % 3, first + (turn + 2) % 3},
                                      {3 - first, 4 - first, 5 - first}});
             double least = 1e9;
-            for (const std::array<Vec3, 3>& c : tree.corners)
+            for (const TreeTriangle& t : tree.triangles) {
+              const std::array<Vec3, 3>& c = t.corners;
               least = std::min(least, closestPointOnTriangle(x, c[0], c[1], c[2]).distance);
+            }
             CHECK(tree.closest(x).distance == least);
           }
   }
@@ -403,7 +418,7 @@ TEST_SUITE("3.2") {
     Gap gap = smallestGap(tree, above.points, above.triangles);
     CHECK(gap.distance <= .25);
     CHECK(gap.distance == doctest::Approx(tree.closest(above.points[17]).distance).epsilon(1e-12));
-    CHECK(tree.triangle.size() == S.triangles.size());
+    CHECK(tree.triangles.size() == S.triangles.size());
     CHECK(gap.triangle >= 0);
     CHECK(gap.other >= 0);
   }
@@ -421,9 +436,10 @@ TEST_SUITE("3.2") {
     constexpr int m = 4;
     double largest = 0;
     for (const auto& [from, to] : {std::make_pair(&treeA, &treeB), std::make_pair(&treeB, &treeA)})
-      for (const std::array<Vec3, 3>& c : from->corners)
+      for (const TreeTriangle& t : from->triangles)
         for (int i = 0; i <= m; ++i)
           for (int j = 0; i + j <= m; ++j) {
+            const std::array<Vec3, 3>& c = t.corners;
             const Vec3 p =
                 (1. / m) * (double(m - i - j) * c[0] + double(i) * c[1] + double(j) * c[2]);
             largest = std::max(largest, to->closest(p).distance);
