@@ -37,6 +37,7 @@ void growBox(TriangleTree::Box& box, Vec3 p) {
 /// The numbers of what is marked, ascending.
 std::vector<int> markedOf(const std::vector<char>& mark) {
   std::vector<int> marked;
+  marked.reserve(mark.size() - std::count(mark.begin(), mark.end(), 0));
   for (std::size_t i = 0; i < mark.size(); ++i)
     if (mark[i]) marked.push_back(static_cast<int>(i));
   return marked;
@@ -3882,7 +3883,7 @@ void keepNearerOnEdge(Vec3 x, const std::array<Vec3, 3>& corner, int i, ClosestP
 }
 
 /// Distance of two boxes, squared, 0 where they meet; a point is a box too.
-double boxDistance2(const TriangleTree::Box& a, const TriangleTree::Box& b) {
+inline double boxDistance2(const TriangleTree::Box& a, const TriangleTree::Box& b) {
   const Vec3 after = a.lo - b.hi, before = b.lo - a.hi;
   return norm2(Vec3{std::max(std::max(after.x, before.x), 0.),
                     std::max(std::max(after.y, before.y), 0.),
@@ -3929,23 +3930,29 @@ void buildTreeNode(TriangleTree& tree, const std::vector<TriangleTree::Box>& box
 }
 
 /// Calls visit(i) for the triangles (in tree order) of leaves not farther from `box` than `bound`,
-/// which visit() lowers; the nearer child first. From node n on.
+/// which visit() lowers; the nearer child first.
 template <class Visit>
-void visitNearest(const TriangleTree& tree, int n, double distance2, const TriangleTree::Box& box,
-                  const double& bound, const Visit& visit) {
-  if (isFarther(distance2, bound)) return;
-  const TriangleTree::Node& node = tree.nodes[n];
-  for (int i = node.first; i < node.first + node.count; ++i) visit(i);
-  if (node.count > 0) return;
-  int near = n + 1, far = node.right;
-  double toNear = boxDistance2(tree.nodes[near].box, box);
-  double toFar = boxDistance2(tree.nodes[far].box, box);
-  if (toFar < toNear) {
-    std::swap(near, far);
-    std::swap(toNear, toFar);
+void visitNearest(const TriangleTree& tree, const TriangleTree::Box& box, const double& bound,
+                  const Visit& visit) {
+  struct Pending {
+    int node;
+    double distance2;
+  };
+  Pending pending[64];  // each level halves the triangles: 32 levels at most
+  int count = 0;
+  if (!tree.nodes.empty()) pending[count++] = {0, boxDistance2(tree.nodes[0].box, box)};
+  while (count > 0) {
+    Pending at = pending[--count];
+    while (!isFarther(at.distance2, bound)) {
+      const TriangleTree::Node& node = tree.nodes[at.node];
+      for (int i = node.first; i < node.first + node.count; ++i) visit(i);
+      if (node.count > 0) break;
+      Pending far{node.right, boxDistance2(tree.nodes[node.right].box, box)};
+      at = {at.node + 1, boxDistance2(tree.nodes[at.node + 1].box, box)};
+      if (far.distance2 < at.distance2) std::swap(at, far);
+      if (!isFarther(far.distance2, bound)) pending[count++] = far;
+    }
   }
-  visitNearest(tree, near, toNear, box, bound, visit);
-  visitNearest(tree, far, toFar, box, bound, visit);
 }
 
 }  // namespace
@@ -4045,7 +4052,7 @@ ClosestPoint TriangleTree::closest(Vec3 x, double within) const {
   const Box& box = nodes[0].box;
   const double rounding =
       ofDiagonal * norm(box.hi - box.lo) + ofCoordinates * (norm(box.hi) + norm(box.lo));
-  visitNearest(*this, 0, boxDistance2(nodes[0].box, {x, x}), {x, x}, best.distance, [&](int i) {
+  visitNearest(*this, {x, x}, best.distance, [&](int i) {
     if (!triangles[i].isWithin(x, (1 + ofDistance) * best.distance + rounding)) return;
     const std::array<Vec3, 3>& c = triangles[i].corners;
     ClosestPoint p = closestPointOnTriangle(x, c[0], c[1], c[2]);
@@ -4205,10 +4212,9 @@ bool trianglesCross(const TriangleSurface& S, int t, int s, Vec3& at) {
 
 /// A triangle (in tree order) that is not farther than this from x, the first one found; -1: none.
 int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
-  if (tree.nodes.empty()) return -1;
   double bound = distance;  // −1 ends the search
   int found = -1;
-  visitNearest(tree, 0, boxDistance2(tree.nodes[0].box, {x, x}), {x, x}, bound, [&](int i) {
+  visitNearest(tree, {x, x}, bound, [&](int i) {
     if (found < 0 && tree.triangles[i].isWithin(x, distance)) found = i, bound = -1;
   });
   return found;
@@ -4289,12 +4295,11 @@ Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, d
 Gap gapWithin(const TriangleTree& tree, const std::vector<Vec3>& points,
               const std::vector<std::array<int, 3>>& triangles, double within) {
   Gap gap{within, -1, -1, {}};
-  for (std::size_t o = 0; o < triangles.size() && !tree.nodes.empty(); ++o) {
+  for (std::size_t o = 0; o < triangles.size(); ++o) {
     const std::array<int, 3>& v = triangles[o];
     const std::array<Vec3, 3> other{points[v[0]], points[v[1]], points[v[2]]};
     const TriangleTree::Box box = boxOf(other);
-    const double start = boxDistance2(tree.nodes[0].box, box);
-    visitNearest(tree, 0, start, box, gap.distance, [&](int i) {
+    visitNearest(tree, box, gap.distance, [&](int i) {
       Vec3 on;
       const double d = trianglesDistance(tree.triangles[i].corners, other, on);
       if (d < gap.distance) gap = {d, tree.triangles[i].number, static_cast<int>(o), on};
@@ -4813,14 +4818,21 @@ KeyMap cubesAtNodes(const Mesh& M, const Approximation& A, std::vector<std::uint
   return at;
 }
 
+/// Which nodes are of elements of 𝓣.
+std::vector<char> nodesOf(const Mesh& M, const Approximation& A) {
+  std::vector<char> isOfT(M.x.size(), 0);
+  for (int E : markedOf(A.T))
+    for (int n : M.tets[E]) isOfT[n] = 1;
+  return isOfT;
+}
+
 /// The lattice nodes of 𝓣: place → 1 + mesh node.
-KeyMap nodesOf(const Mesh& M, const Approximation& A) {
+KeyMap latticeNodesOf(const Mesh& M, const Approximation& A) {
   const Lattice lattice(A.level);
-  const std::vector<int> elements = markedOf(A.T);
-  KeyMap meshNode(elements.size() / 3);
-  for (int E : elements)
-    for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
+  const std::vector<int> nodes = markedOf(nodesOf(M, A));
+  KeyMap meshNode(nodes.size());
+  for (int n : nodes)
+    if (lattice.isNode(M.xi[n])) meshNode[lattice.node(M.xi[n])] = n + 1;
   return meshNode;
 }
 
@@ -4859,7 +4871,7 @@ void volumetricHealing(Bisection& B, Approximation& A) {
     for (std::uint64_t key : keys)
       if (!isDisk[cubes.get(key)]) bad.push_back(key);
     if (bad.empty()) return;
-    const KeyMap meshNode = nodesOf(B.M, A);
+    const KeyMap meshNode = latticeNodesOf(B.M, A);
     for (std::uint64_t key : bad) {
       const int n = meshNode.get(key) - 1;
       if (isOnBoundary(B.M, n))
@@ -4921,10 +4933,9 @@ void addCubesInCone(const Mesh& M, std::array<int, 4> z, int i, const Lattice& l
   const Mat3 images{M.x[z[1]] - x, M.x[z[2]] - x, M.x[z[3]] - x};
   const Mat3 toEdges = inverse(edges);
   const double half = .5 / lattice.scale;
-  for (int corner = 0; corner < 8; ++corner) {
-    const Vec3 toCentre{corner & 1 ? half : -half, corner & 2 ? half : -half,
-                        corner & 4 ? half : -half};
-    const Vec3 w = toEdges * toCentre;
+  const Vec3 a = half * toEdges.c0, b = half * toEdges.c1, c = half * toEdges.c2;
+  for (int corner = 0; corner < 8; ++corner) {  // the centre is at (±half, ±half, ±half)
+    const Vec3 w = (corner & 1 ? a : -a) + (corner & 2 ? b : -b) + (corner & 4 ? c : -c);
     if (w.x >= 0 && w.y >= 0 && w.z >= 0)
       cubes.add(cornerOf(lattice.node(at), corner), x + images * w);
   }
@@ -4934,10 +4945,8 @@ void addCubesInCone(const Mesh& M, std::array<int, 4> z, int i, const Lattice& l
 Cubes cubesAround(const Mesh& M, const Approximation& A) {
   const Lattice lattice(A.level);
   Cubes cubes(M, A);
-  std::vector<char> touches(M.x.size(), 0);  // the nodes around which all cubes are taken
-  for (int E : markedOf(A.T))
-    for (int n : M.tets[E])
-      if (lattice.isNode(M.xi[n])) touches[n] = !isOnBoundary(M, n);
+  std::vector<char> touches = nodesOf(M, A);  // the nodes around which all cubes are taken
+  for (int n : markedOf(touches)) touches[n] = lattice.isNode(M.xi[n]) && !isOnBoundary(M, n);
   for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int i = 0; i < 4 && !A.T[E]; ++i)
       if (touches[M.tets[E][i]]) addCubesInCone(M, M.tets[E], i, lattice, cubes);
@@ -5092,9 +5101,7 @@ DividedCubes divideCubes(const Mesh& M, const Approximation& A, const SurfaceDis
 /// [choice] Elements at faces of earlier surfaces that touch 𝓣 are refined to its level: coarse
 /// faces are off their surface, which S may be nearer to.
 void refineSurfacesAround(Bisection& B, Approximation& A) {
-  std::vector<char> isOfT(B.M.x.size(), 0);
-  for (int E : markedOf(A.T))
-    for (int n : B.M.tets[E]) isOfT[n] = 1;
+  std::vector<char> isOfT = nodesOf(B.M, A);
   const auto isCoarse = [&](int E) {
     const std::array<int, 4>&z = B.M.tets[E], &label = B.M.faceLabel[E];
     const bool isAtSurface = *std::max_element(label.begin(), label.end()) > 0;
@@ -5113,7 +5120,7 @@ Approximation middleApproximation(Bisection& B, Approximation A, const SurfaceDi
                                   double perDistance, const Crew& crew) {
   refineSurfacesAround(B, A);
   const DividedCubes cubes = divideCubes(B.M, A, S, perDistance, crew);
-  const KeyMap meshNode = nodesOf(B.M, A);
+  const KeyMap meshNode = latticeNodesOf(B.M, A);
   for (std::uint64_t cube : cubes.touching) {
     int node = 0;
     for (int k = 0; k < 8 && node == 0; ++k) node = meshNode.get(cornerOf(cube, k));
@@ -5261,7 +5268,7 @@ SquareSurface boundarySquares(const Mesh& M, const Approximation& A) {
   SquareSurface Q;
   Q.level = A.level, Q.isMiddle = A.isMiddle;
   Q.h = cubeEdge(M, A.level);
-  addSquares(M, A, nodesOf(M, A), Q);
+  addSquares(M, A, latticeNodesOf(M, A), Q);
   joinSquares(Q);
   findDiagonals(M, A, Q);
   collectNodes(Q, static_cast<int>(M.x.size()));
