@@ -4000,25 +4000,19 @@ TriangleTree::TriangleTree(const std::vector<Vec3>& x, const std::vector<std::ar
     triangles.emplace_back(centre.triangle, all[centre.triangle], cornersAt(centre.triangle));
 }
 
-namespace {
-
-/// Of the angle at corner 0 of a needle.
-constexpr double needleSine = 1e-3;
-
-}  // namespace
-
 TreeTriangle::TreeTriangle(int inputNumber, const std::array<int, 3>& numbers,
                            const std::array<Vec3, 3>& c)
-    : number(inputNumber),
+    : corners(c),
+      number(inputNumber),
       points(numbers),
-      corners(c),
-      edge_{c[1] - c[0], c[2] - c[1], c[0] - c[2]},
-      length2_{norm2(edge_[0]), norm2(edge_[1]), norm2(edge_[2])},
-      n_(cross(edge_[2], edge_[0])),
-      inward0_(cross(n_, edge_[0])),
-      inward2_(cross(n_, edge_[2])),
+      n_(cross(c[0] - c[2], c[1] - c[0])),
+      inward0_(cross(n_, c[1] - c[0])),
+      inward2_(cross(n_, c[0] - c[2])),
       n2_(norm2(n_)),
-      isNeedle_(!(n2_ > needleSine * needleSine * length2_[0] * length2_[2])) {}
+      length2_{norm2(c[1] - c[0]), norm2(c[2] - c[1]), norm2(c[0] - c[2])} {
+  constexpr double needleSine = 1e-3;  // of the angle at corner 0
+  isNeedle_ = !(n2_ > needleSine * needleSine * length2_[0] * length2_[2]);
+}
 
 bool TreeTriangle::isWithin(Vec3 x, double distance) const {
   constexpr double rounding = 1e-9;  // of n and what follows, with room
@@ -4036,10 +4030,10 @@ bool TreeTriangle::isWithin(Vec3 x, double distance) const {
     if (w[k] < 0 && w[k] * w[k] > beside2 * length2_[k]) return false;  // of the edge's line
   if (w[0] > 0 && w[1] > 0 && w[2] > 0 && height * height <= allowed2) return true;
   for (int k = 0; k < 3; ++k) {
-    const Vec3 q = x - c[k];
-    const double along = dot(q, edge_[k]);
+    const Vec3 q = x - c[k], edge = c[(k + 1) % 3] - c[k];
+    const double along = dot(q, edge);
     const double t = along <= 0 ? 0 : along >= length2_[k] ? 1 : along / length2_[k];
-    if (norm2(q - t * edge_[k]) <= distance * distance) return true;
+    if (norm2(q - t * edge) <= distance * distance) return true;
   }
   return false;
 }
@@ -4226,7 +4220,7 @@ int triangleWithin(const TriangleTree& tree, Vec3 x, double distance) {
 Width sampledDistance(const TriangleTree& A, const TriangleTree& B, int least, double spacing,
                       Width largest, int from, int to) {
   constexpr double mostSteps = 1000;
-  std::array<int, 8> recent{};  // triangles of B that were near last: neighbours in A are so too
+  std::array<int, 4> recent{};  // triangles of B that were near last: neighbours in A are so too
   const auto isNear = [&](Vec3 p, int b) { return B.triangles[b].isWithin(p, largest.distance); };
   const auto isNearRecent = [&](Vec3 p) {
     for (int& b : recent)

@@ -616,9 +616,9 @@ ClosestPoint closestPointOnTriangle(Vec3 x, Vec3 a, Vec3 b, Vec3 c);
 
 /// A triangle of a tree, with what the test of nearness takes.
 struct TreeTriangle {
+  std::array<Vec3, 3> corners;
   int number;                 // of the input
   std::array<int, 3> points;  // numbers of the corners
-  std::array<Vec3, 3> corners;
 
   TreeTriangle(int number, const std::array<int, 3>& points, const std::array<Vec3, 3>& corners);
   /// Whether x is not farther than this; without roots, and mostly without division. Of a needle,
@@ -626,10 +626,9 @@ struct TreeTriangle {
   bool isWithin(Vec3 x, double distance) const;
 
  private:
-  std::array<Vec3, 3> edge_;
-  std::array<double, 3> length2_;  // of the edges, squared
-  Vec3 n_, inward0_, inward2_;     // normal, and those of edges 0 and 2 in the plane
+  Vec3 n_, inward0_, inward2_;  // normal, and those of edges 0 and 2 in the plane
   double n2_;
+  std::array<double, 3> length2_;  // of the edges, squared
   bool isNeedle_;
 };
 
