@@ -496,8 +496,8 @@ void addKuhnCell(Mesh& M, std::array<int, 3> i, Node node, Label label) {
 
 Mesh boxMesh(Vec3 origin, Vec3 size, std::array<int, 3> cells) {
   if (!isFinite(origin) || !isFinite(size) || !(size.x > 0 && size.y > 0 && size.z > 0))
-    throw InputError("boxMesh: origin and size must be finite and size above 0, not size = " +
-                     number(size.x) + " " + number(size.y) + " " + number(size.z));
+    throw InputError("boxMesh: origin and size must be finite and size above 0, not " +
+                     placeText(origin) + " and " + placeText(size));
   for (int n : cells)
     if (n < 1 || n > 1000)
       throw InputError("boxMesh: each number of cells must be from 1 to 1000, not " +
@@ -2502,6 +2502,7 @@ void bisect(Mesh& M, const std::vector<int>& E) {
 namespace {
 
 void checkTerrain(const Terrain& T) {
+  constexpr double farTop = 1e6;  // [choice] of the terrain's extent: no atmosphere is as high
   const auto refuse = [](const std::string& what) {
     throw InputError("meccanoMesher (§2): " + what);
   };
@@ -2510,6 +2511,7 @@ void checkTerrain(const Terrain& T) {
            std::to_string(T.nx) + " x " + std::to_string(T.ny) + " points, " +
            std::to_string(T.z.size()) + " heights");
   if (!(T.cell > 0) || !std::isfinite(T.cell)) refuse("the terrain's cell must be above 0");
+  const double highest = farTop * T.cell * std::max(T.nx, T.ny);
   for (std::size_t k = 0; k < T.z.size(); ++k) {
     const std::string where =
         " at grid point (" + std::to_string(k % T.nx) + ", " + std::to_string(k / T.nx) + ")";
@@ -2517,6 +2519,9 @@ void checkTerrain(const Terrain& T) {
     if (!(T.z[k] < T.top))
       refuse("the height " + number(T.z[k]) + where + " is not below the top " + number(T.top) +
              "; raise the top");
+    if (!(T.top - T.z[k] < highest))
+      refuse("the top " + number(T.top) + " is farther above the height " + number(T.z[k]) + where +
+             " than a million times the terrain's extent; lower the top");
   }
 }
 
@@ -3502,19 +3507,26 @@ constexpr double zeroHeight = 1e-14;
   throw InputError("insertSurface (§3.1): " + what);
 }
 
-/// Refuses indices out of range and coordinates that are not finite.
+/// Refuses indices out of range, and coordinates that are not finite or no places.
 void checkNumbers(const TriangleSurface& S) {
+  constexpr double farthest = 1e20;  // [choice] length units: no-data values are larger
   const int points = static_cast<int>(S.points.size());
+  const auto refusePoint = [&S](int n, const std::string& wanted) {
+    refuseSurface("point " + std::to_string(n) + " has the coordinates " + placeText(S.points[n]) +
+                  "; all coordinates must be " + wanted);
+  };
   for (int n = 0; n < points; ++n)
-    if (!isFinite(S.points[n]))
-      refuseSurface("point " + std::to_string(n) + " has the coordinates " +
-                    placeText(S.points[n]) + "; all coordinates must be finite numbers");
+    if (!isFinite(S.points[n])) refusePoint(n, "finite numbers");
   for (std::size_t t = 0; t < S.triangles.size(); ++t)
-    for (int n : S.triangles[t])
+    for (int n : S.triangles[t]) {
       if (n < 0 || n >= points)
         refuseSurface("triangle " + std::to_string(t) + " names point " + std::to_string(n) +
                       ", but there are " + counted(points, "point") +
                       " (counted from 0); correct the index");
+      const Vec3 p = S.points[n];
+      if (std::max({std::abs(p.x), std::abs(p.y), std::abs(p.z)}) > farthest)
+        refusePoint(n, "below 1e20, and no-data values left out");
+    }
 }
 
 bool hasZeroArea(Vec3 a, Vec3 b, Vec3 c) {
@@ -6910,12 +6922,29 @@ std::string at(const Gap& gap) {
   return " at triangle " + std::to_string(gap.triangle) + " near " + placeText(gap.point);
 }
 
+[[noreturn]] void refuseOutside(const std::string& where) {
+  throw InputError("insertSurface (§3.1): S touches or leaves the domain" + where +
+                   "; it must lie inside");
+}
+
+/// What the box of the domain tells of S as it is given, before needles that leave it are dropped
+/// and anything is computed with coordinates far beyond it.
+void checkInBox(const Mesh& M, const TriangleSurface& S) {
+  checkNumbers(S);
+  TriangleTree::Box box{M.x[0], M.x[0]};
+  for (Vec3 x : M.x) growBox(box, x);
+  for (const std::array<int, 3>& triangle : S.triangles)
+    for (int n : triangle)
+      if (const Vec3 p = S.points[n]; !boxesMeet(box, p, p))
+        refuseOutside(" near " + placeText(p) + ": the domain is within " + placeText(box.lo) +
+                      " to " + placeText(box.hi));
+}
+
 /// l_c against the distances of §3.1 and §3.2: S inside the domain, and clear of earlier surfaces.
 void checkDistances(const Mesh& M, const SurfaceDistance& S, double lc) {
   const Gap gap = gapWithin(S.tree, M.x, patchFaces(M), aboveDiagonal * lc);
-  if (gap.distance <= 0 || !contains(M, S.S.points[0]))
-    throw InputError("insertSurface (§3.1): S touches or leaves the domain" +
-                     (gap.distance <= 0 ? at(gap) : std::string()) + "; it must lie inside");
+  if (gap.distance <= 0) refuseOutside(at(gap));
+  if (!contains(M, S.S.points[0])) refuseOutside(" near " + placeText(S.S.points[0]));
   if (!(lc < gap.distance))
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " is not below dist(∂M, S) = " +
                      number(gap.distance) + at(gap) + "; lower l_c");
@@ -7687,13 +7716,16 @@ auto labelled(const std::string& label, Step step) -> decltype(step()) {
 }
 
 /// The surfaces of a call, each component one; labels only where there are several.
-std::vector<Candidate> candidatesOf(const std::vector<TriangleSurface>& S, const Crew& crew) {
+std::vector<Candidate> candidatesOf(const Mesh& M, const std::vector<TriangleSurface>& S,
+                                    const Crew& crew) {
   std::vector<Candidate> all;
   for (std::size_t i = 0; i < S.size(); ++i) {
     const std::string given = S.size() > 1 ? labelOf(S[i].name, i + 1) : "";
     std::vector<std::string> warnings;
-    const std::vector<TriangleSurface> components =
-        labelled(given, [&] { return connectedComponents(S[i], warnings); });
+    const std::vector<TriangleSurface> components = labelled(given, [&] {
+      checkInBox(M, S[i]);
+      return connectedComponents(S[i], warnings);
+    });
     for (const TriangleSurface& one : components) {
       const std::string label = components.size() > 1 ? labelOf(one.name, i + 1) : given;
       all.push_back(labelled(label, [&] { return candidateOf(one, label, warnings, crew); }));
@@ -7786,6 +7818,7 @@ std::vector<double> checkStart(const Mesh& M, const InsertOptions& options) {
 InsertReport insertSurface(Mesh& M, const TriangleSurface& S, const InsertOptions& options) {
   const std::vector<double> q = checkStart(M, options);
   const Crew crew(options.optimize.threads);
+  checkInBox(M, S);
   const Candidate one = candidateOf(S, "", {}, crew);
   checkApart(M, {one});
   return insertCandidate(M, one, options, q, crew);
@@ -7795,7 +7828,7 @@ std::vector<InsertReport> insertSurfaces(Mesh& M, const std::vector<TriangleSurf
                                          const InsertOptions& options) {
   std::vector<double> q = checkStart(M, options);
   const Crew crew(options.optimize.threads);
-  std::vector<Candidate> all = candidatesOf(S, crew);
+  std::vector<Candidate> all = candidatesOf(M, S, crew);
   checkApart(M, all);
   largestFirst(all);
   Mesh result = M;

@@ -1067,6 +1067,8 @@ WolfeStep strongWolfe(const std::function<LinePoint(double t)>& F, double tFirst
 /// slide on their entities, corners stay. Works on any tetrahedral mesh: without M.xi the ideal
 /// elements are regular, without M.dimension the boundary is fixed. Indices and entities keep; M.x
 /// and M.parameter change. A node of more than 20000 elements stays.
+/// Tetrahedra without M.xi have to be positively oriented; half of those in bisection order are
+/// not.
 ///   errors  InputError: options out of range, a malformed mesh.
 ///           No exception for an unfinished optimization: see the report. Where a callback throws
 ///           M is left as it is then.
@@ -1074,6 +1076,7 @@ OptimizeReport optimizeMesh(Mesh& M, const OptimizeOptions& options = {});
 
 /// [§4, Table I] Statistics of q against the computational elements, or against the regular
 /// tetrahedron (where M has no computational coordinates, always).
+///   errors  InputError: a tetrahedron names a node that is not there.
 enum class Ideal { computational, regular };
 QualityStatistics qualityStatistics(const Mesh& M, Ideal ideal = Ideal::computational);
 QualityStatistics qualityStatistics(const std::vector<double>& q);

@@ -2196,6 +2196,9 @@ void checkEntity(const Mesh& M, std::size_t n) {
            " has no locator; call buildLocator() first");
 }
 
+/// Length units: σ² of its elements neither underflows nor, of a mesh as much larger, overflows.
+constexpr double smallestExtent = 1e-40;
+
 void checkNodes(const Mesh& M) {
   const std::size_t nodes = M.x.size();
   const auto demandSize = [nodes](const char* name, std::size_t size) {
@@ -2204,12 +2207,24 @@ void checkNodes(const Mesh& M) {
              std::to_string(nodes) + ", one per node");
   };
   if (!M.xi.empty()) demandSize("M.xi", M.xi.size());
+  Vec3 lo{0, 0, 0}, hi{0, 0, 0};
   for (std::size_t n = 0; n < nodes; ++n) {
-    if (!isFinite(M.x[n]))
+    const Vec3 x = M.x[n];
+    if (!isFinite(x))
       refuse("node " + std::to_string(n) + " has a coordinate that is not finite; correct M.x");
+    if (n == 0) lo = hi = x;
+    lo = {std::min(lo.x, x.x), std::min(lo.y, x.y), std::min(lo.z, x.z)};
+    hi = {std::max(hi.x, x.x), std::max(hi.y, x.y), std::max(hi.z, x.z)};
     if (!M.xi.empty() && !isFinite(M.xi[n]))
       refuse("node " + std::to_string(n) +
              " has a computational coordinate that is not finite; correct M.xi");
+  }
+  const double extent = std::max({hi.x - lo.x, hi.y - lo.y, hi.z - lo.z});
+  if (nodes > 0 && !(extent > smallestExtent && extent < 1 / smallestExtent)) {
+    char text[120];
+    std::snprintf(text, sizeof text, "the mesh's extent %g must be from %g to %g; scale M.x",
+                  extent, smallestExtent, 1 / smallestExtent);
+    refuse(text);
   }
   if (M.dimension.empty()) return;
   demandSize("M.dimension", M.dimension.size());
@@ -2222,13 +2237,23 @@ void checkNodes(const Mesh& M) {
 /// digit.
 constexpr double degenerateIdeal = 1e-13;
 
-void checkElements(const Mesh& M) {
+void checkIndices(const Mesh& M, const std::string& who) {
   const int nodes = static_cast<int>(M.x.size());
-  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+  for (std::size_t E = 0; E < M.tets.size(); ++E)
     for (int n : M.tets[E])
       if (n < 0 || n >= nodes)
-        refuse("tetrahedron " + std::to_string(E) + " names node " + std::to_string(n) +
-               ", but nodes are 0 to " + std::to_string(nodes - 1));
+        throw InputError(who + ": tetrahedron " + std::to_string(E) + " names node " +
+                         std::to_string(n) + ", but nodes are 0 to " + std::to_string(nodes - 1));
+}
+
+void checkElements(const Mesh& M) {
+  checkIndices(M, "optimizeMesh (§3.7)");
+  for (std::size_t E = 0; E < M.tets.size(); ++E) {
+    for (int i = 1; i < 4; ++i)
+      for (int j = 0; j < i; ++j)
+        if (M.tets[E][i] == M.tets[E][j])
+          refuse("tetrahedron " + std::to_string(E) + " names node " +
+                 std::to_string(M.tets[E][i]) + " twice");
     if (M.xi.empty()) continue;
     const std::array<Vec3, 4> z = cornersOf(M.xi, M.tets[E]);
     double longest2 = 0;
@@ -2339,6 +2364,7 @@ void forQualities(const Mesh& M, Ideal ideal, std::size_t count, const Element& 
 }  // namespace
 
 std::vector<double> qualities(const Mesh& M, Ideal ideal) {
+  checkIndices(M, "qualities (Table I)");
   std::vector<double> all(M.tets.size());
   const auto each = [](std::size_t E) { return static_cast<int>(E); };
   forQualities(M, ideal, all.size(), each, [&all](int E, double q) { all[E] = q; });

@@ -680,6 +680,12 @@ TEST_SUITE("3.7.4") {
     };
     refuses("tetrahedron 3 names node 99", [](Mesh& M) { M.tets[3][1] = 99; });
     refuses("names node -1", [](Mesh& M) { M.tets[0][0] = -1; });
+    refuses("tetrahedron 5 names node 1 twice", [](Mesh& M) { M.tets[5] = {1, 1, 1, 1}; });
+    for (double factor : {0., 1e-150, 1e200}) {
+      Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {2, 2, 2});
+      for (Vec3& p : M.x) p = factor * p;
+      CHECK(contains(messageOf<InputError>([&] { optimizeMesh(M); }), "the mesh's extent "));
+    }
     refuses("node 5 has a coordinate that is not finite", [](Mesh& M) { M.x[5].y = std::nan(""); });
     refuses("node 6 has a computational", [](Mesh& M) { M.xi[6].z = inf; });
     refuses("M.xi has 26 entries", [](Mesh& M) { M.xi.pop_back(); });

@@ -704,9 +704,28 @@ TEST_SUITE("3") {
       for (const std::string& word : words) CHECK_MESSAGE(has(text, word), text);
     };
     const InsertOptions options = withSize(.14);
-    refused(placed(S, {.5, 0, 0}, 1), options,
-            {"S touches or leaves the domain at triangle ", " near (", "it must lie inside"});
-    refused(placed(S, {2, 0, 0}, 1), options, {"S touches or leaves the domain; it must"});
+    refused(
+        placed(S, {.5, 0, 0}, 1), options,
+        {"S touches or leaves the domain near (", "is within (0, 0, 0) to (1, 1, 1); it must lie"});
+    refused(placed(S, {2, 0, 0}, 1), options, {"S touches or leaves the domain near ("});
+    double right = 0;
+    for (Vec3 x : S.points) right = std::max(right, x.x);
+    refused(placed(S, {1 - right, 0, 0}, 1), options,
+            {"S touches or leaves the domain at triangle ", " near (1, ", "it must lie inside"});
+    TriangleSurface far = S;
+    for (double z : {-2., 1e9, 1e19}) {
+      far.points[12].z = z;
+      refused(far, options, {"S touches or leaves the domain near (", "it must lie inside"});
+      refused(far, InsertOptions{}, {"S touches or leaves the domain near ("});
+      Mesh M = unitBox();
+      CHECK_THROWS_AS(insertSurfaces(M, {far}, options), InputError);
+    }
+    for (double z : {1e30, -1e100, 1e308}) {
+      far.points[12].z = z;
+      refused(far, options, {"point 12 has the coordinates (", "must be below 1e20"});
+      std::vector<std::string> warnings;
+      CHECK_THROWS_AS(weldSurface(far, warnings), InputError);
+    }
     refused(S, withSize(.6), {"l_c = 0.6 is not below dist(∂M, S) = 0.", "near (", "lower l_c"});
     refused(placed(S, {.45, .45, .45}, .1), options,
             {"S, of extent 0.", "smaller than two cubes of edge", "lower l_c to 0."});

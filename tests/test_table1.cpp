@@ -146,6 +146,15 @@ TEST_SUITE("Table I") {
           std::vector<double>(M.tets.size(), .25));
   }
 
+  TEST_CASE("Table I: a node that is not there is refused") {
+    Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {1, 1, 1});
+    for (int n : {8, -1}) {
+      M.tets[2][3] = n;
+      CHECK_THROWS_AS(qualityStatistics(M), InputError);
+      CHECK_THROWS_AS(qualities(M, Ideal::regular), InputError);
+    }
+  }
+
   TEST_CASE("Table I: no elements, all zero") {
     const QualityStatistics table = qualityStatistics(Mesh{});
     CHECK(table.tetrahedra == 0);
