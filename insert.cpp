@@ -3058,7 +3058,7 @@ std::string sizeText(const Mesh& M) { return std::to_string(M.tets.size()) + " t
 [[noreturn]] void refuseSize(const MesherOptions& options, double predicted) {
   throw InputError("meccanoMesher (§2): eps = " + number(options.eps) + " asks for about " +
                    number(predicted) + " tetrahedra, above the limit of " +
-                   std::to_string(options.maxTets) + "; raise eps or the limit");
+                   std::to_string(options.maxTets) + "; raise eps or maxTets");
 }
 
 /// The sum over a closed surface's edges of length × angle between the normals beside it. Sharp
@@ -6966,7 +6966,7 @@ void checkSize(const Mesh& M, const SurfaceDistance& S, double lc, int maxTets) 
   if (predicted > maxTets)
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) + " asks for about " +
                      number(predicted) + " tetrahedra, above the limit of " +
-                     std::to_string(maxTets) + "; raise l_c or the limit");
+                     std::to_string(maxTets) + "; raise l_c or maxTets");
   if (level > maxLevel || farthest > std::exp2((maxLevel - level) / 3))
     throw InputError("insertSurface (§3.2): l_c = " + number(lc) +
                      " is below 1/500000 of the domain; raise l_c");
@@ -7648,7 +7648,7 @@ void searchSize(Insertion& I, const std::vector<double>& sizes, Mesh& result,
                       " at l_c = " + number(sizes[0]) + " to " + number(last) +
                       ": the nearest has the Hausdorff distance " + number(nearest) +
                       ", and the next was left because " + I.reason +
-                      "; raise the tolerance or the limit");
+                      "; raise the tolerance or maxTets");
   const std::string wanted = E > 0 ? " within the tolerance " + number(E) : "";
   throw MethodError("insertSurface (§3): no valid mesh" + wanted + " at l_c = " + number(sizes[0]) +
                     (last < sizes[0] ? " nor down to " + number(last) : "") + ", after " +

@@ -3145,6 +3145,17 @@ std::string histogramText(const QualityStatistics& q, const std::string& title, 
 
 // ==== Arguments =================================================================================
 
+std::string counted(std::size_t n, const std::string& one) {
+  return std::to_string(n) + ' ' + one + (n == 1 ? "" : "s");
+}
+
+/// Control characters, which a message may quote from a file, are for no terminal.
+std::string printable(std::string text) {
+  for (char& c : text)
+    if (static_cast<unsigned char>(c) < ' ' || c == 127) c = '?';
+  return text;
+}
+
 /// Wrong usage: exit status 2.
 struct UsageError : std::runtime_error {
   using std::runtime_error::runtime_error;
@@ -3169,7 +3180,8 @@ struct Arguments {
     Number value{};
     if (!parse(found->second[i], value))
       throw UsageError("'" + found->second[i] + "' is no " +
-                       (std::is_same_v<Number, int> ? "integer" : "number") + " for " + name);
+                       (std::is_same_v<Number, int> ? "integer up to 2147483647" : "number") +
+                       " for " + name);
     if (!std::isfinite(double(value))) throw UsageError(std::string(name) + " must be finite");
     return value;
   }
@@ -3177,14 +3189,21 @@ struct Arguments {
     return {number(name, otherwise.x, 0), number(name, otherwise.y, 1),
             number(name, otherwise.z, 2)};
   }
-  /// The mesh to write: a file of a known suffix, or a device.
-  std::string output() const {
+  /// The mesh to write: a file of a known suffix, or a device; not what is read as something else
+  /// than the mesh that is changed, as the operands from `kept` on.
+  std::string output(std::size_t kept) const {
     const auto found = options.find("-o");
     if (found == options.end()) throw UsageError("the output is missing: -o OUT");
     const std::string& path = found->second[0];
     if (!isMeshSuffix(suffixOf(path)) && !isDevice(path))
       throw UsageError("'" + path + "' does not end in " + meshSuffixes +
                        ", the formats of the output");
+    std::vector<std::string> read(operands.begin() + kept, operands.end());
+    for (const char* name : {"--ideal", "--polycube"})
+      if (has(name)) read.push_back(options.at(name)[0]);
+    for (const std::string& input : read)
+      if (std::error_code none; !isDevice(path) && fs::equivalent(path, input, none))
+        throw UsageError("'" + path + "' would be read and overwritten; write the mesh elsewhere");
     return path;
   }
   /// The picture an option names: an .svg file, or a device; "" where the option is not given.
@@ -3208,7 +3227,7 @@ class Progress {
   ~Progress() { endSweeps(); }
   void line(const std::string& text) {
     endSweeps();
-    if (!quiet_) io_.err << text << std::endl;
+    if (!quiet_) io_.err << printable(text) << std::endl;
   }
   /// For onSweep, which costs a pass over the mesh: none where nobody looks.
   std::function<void(const Sweep&)> sweeps() {
@@ -3222,7 +3241,7 @@ class Progress {
   }
   void warning(const std::string& text) {
     endSweeps();
-    io_.err << "meccano: warning: " << text << std::endl;
+    io_.err << "meccano: warning: " << printable(text) << std::endl;
   }
 
  private:
@@ -3276,7 +3295,7 @@ std::string sizeOf(const Mesh& M) {
 // ==== Commands ==================================================================================
 
 void runBox(const Arguments& a, const Streams& io) {
-  const std::string path = a.output();
+  const std::string path = a.output(0);
   const std::array<int, 3> cells{a.number("--cells", 1, 0), a.number("--cells", 1, 1),
                                  a.number("--cells", 1, 2)};
   const Vec3 origin = a.vec3("--origin", {0, 0, 0}), size = a.vec3("--size", {1, 1, 1});
@@ -3324,7 +3343,7 @@ void finishMesher(const std::string& path, const Mesh& M, const MesherReport& r,
 }
 
 void runTerrain(const Arguments& a, const Streams& io) {
-  const std::string path = a.output();
+  const std::string path = a.output(0);
   if (!a.has("--top")) throw UsageError("the height of the top is missing: --top Z");
   Progress progress(io, a.has("--quiet"));
   MesherOptions options = mesherOptions(a, progress);
@@ -3335,7 +3354,7 @@ void runTerrain(const Arguments& a, const Streams& io) {
   if (a.has("--cells"))
     for (std::size_t i = 0; i < 3; ++i) {
       T.cells[i] = a.number("--cells", 1, i);
-      if (T.cells[i] < 1) throw UsageError("--cells must be 1 or more");
+      if (T.cells[i] < 1) fail("--cells must be 1 or more");
     }
   const std::array<int, 3> cells = terrainCells(T);
   if (!a.has("--eps")) options.eps = terrainEps(T);
@@ -3349,7 +3368,7 @@ void runTerrain(const Arguments& a, const Streams& io) {
 }
 
 void runSolid(const Arguments& a, const Streams& io) {
-  const std::string path = a.output();
+  const std::string path = a.output(0);
   if (!a.has("--eps")) throw UsageError("the precision is missing: --eps E");
   Progress progress(io, a.has("--quiet"));
   MesherOptions options = mesherOptions(a, progress);
@@ -3366,8 +3385,8 @@ void runSolid(const Arguments& a, const Streams& io) {
     const std::string& file = a.options.at("--polycube")[0];
     options.meccano = parsePolycube(file, readFile(file));
   }
-  progress.line("solid " + a.operands[0] + ": " + std::to_string(S.points.size()) + " points, " +
-                std::to_string(S.triangles.size()) + " triangles");
+  progress.line("solid " + a.operands[0] + ": " + counted(S.points.size(), "point") + ", " +
+                counted(S.triangles.size(), "triangle"));
   Mesh M;
   const MesherReport report = meccanoMesher(M, S, options);
   finishMesher(path, M, report, progress, io);
@@ -3487,15 +3506,15 @@ std::vector<TriangleSurface> readSurfaces(const Arguments& a, Progress& progress
     for (const TriangleSurface& S : readSurfaces(a.operands[i], notes)) {
       surfaces.push_back(S);
       progress.line("surface " + a.operands[i] + ": " + S.name + ", " +
-                    std::to_string(S.points.size()) + " points, " +
-                    std::to_string(S.triangles.size()) + " triangles");
+                    counted(S.points.size(), "point") + ", " +
+                    counted(S.triangles.size(), "triangle"));
     }
   for (const std::string& note : notes) progress.warning(note);
   return surfaces;
 }
 
 void runInsert(const Arguments& a, const Streams& io) {
-  const std::string path = a.output();
+  const std::string path = a.output(1);
   InsertOptions options = insertOptions(a);
   const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
   for (const char* stage : {"original", "refined", "projected", "smoothed"})
@@ -3568,7 +3587,7 @@ std::vector<Vec3> idealNodes(const std::string& path, const Mesh& M) {
 }
 
 void runOptimize(const Arguments& a, const Streams& io) {
-  const std::string path = a.output();
+  const std::string path = a.output(1);
   OptimizeOptions options = optimizeOptions(a);
   checkWritable(path);
   MeshFile file = readMeshFile(a.operands[0]);
@@ -3888,8 +3907,11 @@ std::string usageLine(const Command& c) {
 std::string help(const Command& c) {
   std::string text = "usage: " + usageLine(c) + "\n\n" + c.about + "\n";
   if (!c.options.empty()) text += "\n";
-  for (const Option& o : c.options)
-    text += format("  %-20s %s\n", (std::string(o.name) + " " + o.values).c_str(), o.help);
+  for (const Option& o : c.options) {
+    const std::string option = std::string(o.name) + " " + o.values;
+    const char* layout = option.size() > 20 ? "  %s\n%23s%s\n" : "  %-20s%1s%s\n";
+    text += format(layout, option.c_str(), "", o.help);
+  }
   return text;
 }
 
@@ -3925,7 +3947,7 @@ Arguments parseArguments(const Command& c, const std::vector<std::string>& words
   if (a.operands.size() < c.least || a.operands.size() > c.most)
     throw UsageError(c.most == 0 ? "'" + a.operands[0] + "' is too much, no file is read"
                                  : std::string("needed: ") + c.operands +
-                                       ", given: " + std::to_string(a.operands.size()) + " files");
+                                       ", given: " + counted(a.operands.size(), "file"));
   return a;
 }
 
@@ -3970,7 +3992,7 @@ int run(const std::vector<std::string>& words, const Streams& io) {
   } catch (const std::bad_alloc&) {
     io.err << "meccano: the memory does not suffice; use a larger --lc or a coarser mesh\n";
   } catch (const std::exception& e) {
-    io.err << "meccano: " << e.what() << std::endl;
+    io.err << "meccano: " << printable(e.what()) << std::endl;
   }
   return 1;
 }

@@ -220,7 +220,7 @@ TEST_SUITE("2") {
     CHECK(has(refusal(hill(), withEps(1e-3)), "eps = 0.001 is too small for the terrain's grid, "));
     MesherOptions few = withEps(.5);
     few.maxTets = 2000;
-    CHECK(has(refusal(hill(), few), "above the limit of 2000; raise eps or the limit"));
+    CHECK(has(refusal(hill(), few), "above the limit of 2000; raise eps or maxTets"));
     MesherOptions negative = withEps(.05);
     negative.optimize.threads = -1;
     int lines = 0;
@@ -308,7 +308,7 @@ TEST_SUITE("2") {
     options.onProgress = [&](const std::string&) { ++lines; };
     const std::string text = messageOf([&] { meccanoMesher(M, S, options); });
     CAPTURE(text);
-    CHECK(has(text, "above the limit of 100000; raise eps or the limit"));
+    CHECK(has(text, "above the limit of 100000; raise eps or maxTets"));
     CHECK(lines == 0);  // before any work
     CHECK(shapes::sameMesh(M, before));
     // a lower bound: what it asks for is there where the limit lets it be

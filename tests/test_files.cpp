@@ -1028,13 +1028,16 @@ TEST_SUITE("command line") {
         {{"box", "--colour"}, "there is no option --colour"},
         {{"box", "-o", "a.vtk", "-o", "b.vtk"}, "-o is given twice"},
         {{"box", "-o", "a.vtk", "--size", "1", "2"}, "--size needs X Y Z"},
-        {{"box", "-o", "a.vtk", "--cells", "1", "2", "x"}, "'x' is no integer for --cells"},
+        {{"box", "-o", "a.vtk", "--cells", "1", "2", "x"}, "'x' is no integer up to"},
         {{"box", "-o", "a.vtk", "--size", "1", "2", "x"}, "'x' is no number for --size"},
         {{"box", "-o", "a.vtk", "--size", "1", "2", "inf"}, "--size must be finite"},
         {{"box"}, "the output is missing: -o OUT"},
         {{"box", "-o", "a.stl"}, "'a.stl' does not end in .vtk, .msh or .mesh"},
         {{"box", "a.vtk", "-o", "a.vtk"}, "'a.vtk' is too much, no file is read"},
         {{"stats"}, "needed: MESH, given: 0 files"},
+        {{"convert", "a.vtk"}, "given: 1 file;"},
+        {{"box", "-o", "a.vtk", "--cells", "1", "2", "99999999999"},
+         "'99999999999' is no integer up to 2147483647 for --cells"},
         {{"insert", "m.vtk", "s.obj", "-o", "a-refined.vtk", "--lc", "1", "--stages", "a"},
          "the mesh and a stage would both be written to a-refined.vtk"},
         {{"convert", "a.vtk", "a.doc"}, "'a.doc' ends neither in .vtk, .msh or .mesh (meshes)"}};
@@ -1043,6 +1046,30 @@ TEST_SUITE("command line") {
       CHECK(o.status == 2);
       CHECK_MESSAGE(has(o.err, what), o.err);
     }
+  }
+
+  TEST_CASE("what is read, but for the mesh that is changed, is not overwritten") {
+    Folder folder;
+    const std::string mesh = folder / "m.vtk", other = folder / "other.vtk";
+    REQUIRE(call({"box", "-o", mesh}).status == 0);
+    fs::copy_file(mesh, other);
+    const std::vector<std::vector<std::string>> wrong{
+        {"insert", mesh, other, "-o", other},
+        {"insert", mesh, other, "-o", folder / "./other.vtk"},
+        {"solid", other, "--eps", "1", "-o", other},
+        {"solid", mesh, "--eps", "1", "--polycube", other, "-o", other},
+        {"terrain", other, "--top", "1", "-o", other},
+        {"optimize", mesh, "--ideal", other, "-o", other}};
+    for (const std::vector<std::string>& words : wrong) {
+      const Outcome o = call(words);
+      CHECK(o.status == 2);
+      CHECK_MESSAGE(has(o.err, "would be read and overwritten"), o.err);
+    }
+    CHECK(call({"optimize", mesh, "-o", mesh}).status == 0);
+  }
+
+  TEST_CASE("messages send no control characters of a file to the terminal") {
+    CHECK(printable("a\033[2Jb\n\177 \xe2\x88\x82M") == "a?[2Jb?? \xe2\x88\x82M");
   }
 
   TEST_CASE("--help and --version go to standard output") {
