@@ -2196,7 +2196,7 @@ void checkEntity(const Mesh& M, std::size_t n) {
            " has no locator; call buildLocator() first");
 }
 
-/// Length units: σ² of its elements neither underflows nor, of a mesh as much larger, overflows.
+/// [choice] Length units: σ² of a mesh as small does not underflow, nor overflow of one as large.
 constexpr double smallestExtent = 1e-40;
 
 void checkNodes(const Mesh& M) {
@@ -2220,7 +2220,7 @@ void checkNodes(const Mesh& M) {
              " has a computational coordinate that is not finite; correct M.xi");
   }
   const double extent = std::max({hi.x - lo.x, hi.y - lo.y, hi.z - lo.z});
-  if (nodes > 0 && !(extent > smallestExtent && extent < 1 / smallestExtent)) {
+  if (!M.tets.empty() && !(extent > smallestExtent && extent < 1 / smallestExtent)) {
     char text[120];
     std::snprintf(text, sizeof text, "the mesh's extent %g must be from %g to %g; scale M.x",
                   extent, smallestExtent, 1 / smallestExtent);

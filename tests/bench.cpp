@@ -28,6 +28,7 @@ struct Size {
 };
 constexpr Size sizes[] = {{2, .12}, {2, .06}, {5, .024}, {5, .012}, {5, .006}};
 constexpr int sizeCount = 5;
+constexpr int fine = 64;  // squares of S along an edge, whatever the size
 constexpr const char* stages[] = {"approximated", "healed",    "extracted", "surfaceHealed",
                                   "projected",    "optimized", "smoothed"};
 
@@ -64,8 +65,8 @@ struct Run {
   double tets = 0, seconds = 0, optimizing = 0;
 };
 
-Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
-  const TriangleSurface S = samples::sine(.1, 64);
+Run benchOne(const Size& size, int squares, bool paper, int threads, const Run& smaller) {
+  const TriangleSurface S = samples::sine(.1, squares);
   Mesh M = boxMesh({0, 0, 0}, {1, 1, 1}, {size.cells, size.cells, size.cells});
   InsertOptions options = paper ? InsertOptions::paper() : InsertOptions{};
   options.lc = size.lc;
@@ -82,7 +83,8 @@ Run benchOne(const Size& size, bool paper, int threads, const Run& smaller) {
     const InsertReport report = insertSurface(M, S, options);
     seconds["smoothed"] += clock.lap();
     run.tets = static_cast<double>(M.tets.size()), run.optimizing = seconds["optimized"];
-    std::printf("%8d %6g %3d ", static_cast<int>(M.tets.size()), size.lc, threads);
+    std::printf("%8d %6g %9d %3d ", static_cast<int>(M.tets.size()), size.lc,
+                static_cast<int>(S.triangles.size()), threads);
     for (const char* stage : stages) {
       std::printf("%9.3f", seconds[stage]);
       run.seconds += seconds[stage];
@@ -149,13 +151,15 @@ int main(int argc, char** argv) {
       "of one thread, the wall's of two\n",
       paper ? ", paper()" : "");
   std::printf(
-      "    tets    l_c thr   refine     heal  extract s.healing project optimize  measure    "
+      "    tets    l_c      of S thr   refine     heal  extract s.healing project optimize  "
+      "measure    "
       "tets/s "
       "ns/tet  not opt. sweeps visits B/tet    min   mean growth\n");
   Run last;
   for (int i = 0; i < count && i < sizeCount; ++i) {
-    const Run one = benchOne(sizes[i], paper, 1, last);
-    const Run two = benchOne(sizes[i], paper, 2, {});
+    benchOne(sizes[i], static_cast<int>(std::lround(1 / sizes[i].lc)), paper, 1, {});
+    const Run one = benchOne(sizes[i], fine, paper, 1, last);
+    const Run two = benchOne(sizes[i], fine, paper, 2, {});
     std::printf(
         "%18s on 2 threads (where nothing else runs): optimizer %.2f times, all %.2f times\n", "",
         one.optimizing / two.optimizing, one.seconds / two.seconds);
