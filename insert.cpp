@@ -2110,7 +2110,8 @@ std::vector<std::array<int, 4>> faceNeighbours(const Mesh& M) {
       }
       if (neighbour[group[g].E][group[g].i] >= 0)
         throw InputError("faceNeighbours: the face opposite to vertex " + std::to_string(i) +
-                         " of tetrahedron " + std::to_string(E) + " has more than two tetrahedra; correct the mesh");
+                         " of tetrahedron " + std::to_string(E) +
+                         " has more than two tetrahedra; correct the mesh");
       neighbour[group[g].E][group[g].i] = E;
       neighbour[E][i] = group[g].E;
     }
