@@ -53,7 +53,9 @@ std::string readFile(const std::string& path) {
   File file(std::fopen(path.c_str(), "rb"), std::fclose);
   if (!file) fail(path + ": cannot be read (" + systemError() + "); check its name and its rights");
   std::string text;
-  std::vector<char> block(1 << 20);
+  const std::uintmax_t size = fs::file_size(path, none);
+  if (!none) text.reserve(size);  // not of a pipe
+  std::vector<char> block(1 << 16);
   while (const std::size_t n = std::fread(block.data(), 1, block.size(), file.get()))
     text.append(block.data(), n);
   if (std::ferror(file.get())) fail(path + ": reading broke off (" + systemError() + ")");
@@ -177,6 +179,7 @@ void writeFiles(const std::vector<Output>& outputs) {
 /// A growing text; doubles in the shortest form that reads back as the same double.
 class Text {
  public:
+  explicit Text(std::size_t expected = 0) { text_.reserve(expected); }
   Text& operator<<(std::string_view s) { return text_.append(s), *this; }
   Text& operator<<(int value) { return put(value); }
   Text& operator<<(double value) { return put(value); }
@@ -1269,10 +1272,12 @@ bool hasDirectedEdge(const std::array<int, 3>& t, int a, int b) {
 
 /// Turns the triangles of S_M all one way: that of 𝓢, where their nodes know their u.
 void orientSheet(const Mesh& M, std::vector<Face>& faces) {
-  std::multimap<std::pair<int, int>, int> atEdge;
+  std::vector<std::pair<std::pair<int, int>, int>>
+      atEdge;  // an edge and a face that has it, sorted
   for (std::size_t f = 0; f < faces.size(); ++f)
     for (int i = 0; i < 3; ++i)
-      atEdge.insert({std::minmax(faces[f].nodes[i], faces[f].nodes[(i + 1) % 3]), f});
+      atEdge.push_back({std::minmax(faces[f].nodes[i], faces[f].nodes[(i + 1) % 3]), f});
+  std::sort(atEdge.begin(), atEdge.end());
   std::vector<char> seen(faces.size(), 0);
   std::vector<int> stack;
   for (std::size_t seed = 0; seed < faces.size(); ++seed) {
@@ -1282,8 +1287,9 @@ void orientSheet(const Mesh& M, std::vector<Face>& faces) {
       stack.pop_back();
       for (int i = 0; i < 3; ++i) {
         const int a = t[i], b = t[(i + 1) % 3];
-        const auto range = atEdge.equal_range(std::minmax(a, b));
-        for (auto it = range.first; it != range.second; ++it) {
+        const std::pair<int, int> edge = std::minmax(a, b);
+        auto it = std::lower_bound(atEdge.begin(), atEdge.end(), std::pair{edge, 0});
+        for (; it != atEdge.end() && it->first == edge; ++it) {
           if (seen[it->second]++) continue;
           std::array<int, 3>& other = faces[it->second].nodes;
           if (hasDirectedEdge(other, a, b)) std::swap(other[1], other[2]);
@@ -1306,17 +1312,22 @@ void orientSheet(const Mesh& M, std::vector<Face>& faces) {
 
 /// A face of an inserted surface is seen from both of its tetrahedra: keeps the first of each two.
 void joinFaces(std::vector<Face>& faces) {
-  std::map<std::array<int, 3>, int> number;
-  std::vector<Face> once;
-  for (const Face& f : faces) {
-    std::array<int, 3> key = f.nodes;
-    std::sort(key.begin(), key.end());
-    const auto [at, isNew] = number.insert({key, static_cast<int>(once.size())});
-    if (isNew)
-      once.push_back(f);
-    else
-      once[at->second].q = std::min(once[at->second].q, f.q);
+  std::vector<std::pair<std::array<int, 3>, int>> byNodes;
+  for (std::size_t f = 0; f < faces.size(); ++f) {
+    byNodes.push_back({faces[f].nodes, static_cast<int>(f)});
+    std::sort(byNodes[f].first.begin(), byNodes[f].first.end());
   }
+  std::sort(byNodes.begin(), byNodes.end());
+  std::vector<char> isFirst(faces.size(), 0);
+  int first = 0;
+  for (std::size_t k = 0; k < byNodes.size(); ++k) {
+    const auto& [nodes, f] = byNodes[k];
+    if (k == 0 || nodes != byNodes[k - 1].first) first = f, isFirst[f] = 1;
+    faces[first].q = std::min(faces[first].q, faces[f].q);
+  }
+  std::vector<Face> once;
+  for (std::size_t f = 0; f < faces.size(); ++f)
+    if (isFirst[f]) once.push_back(faces[f]);
   faces = once;
 }
 
@@ -1412,8 +1423,9 @@ void putPointData(Text& out, const Mesh& M) {
 
 /// The mesh as a VTK legacy file: a function of the mesh alone, and parseVtk() gives the mesh back.
 std::string vtkText(const Mesh& M) {
+  constexpr std::size_t perNode = 200, perTet = 80, head = 1000;  // bytes, seldom exceeded
   const Cells C = cellsOf(M);
-  Text out;
+  Text out(head + perNode * M.x.size() + perTet * M.tets.size());
   out << "# vtk DataFile Version 3.0\nmeccano mesh\nASCII\nDATASET UNSTRUCTURED_GRID\n";
   if (!M.xi.empty()) putField(out, packGeometry(M));
   out << "POINTS " << static_cast<int>(M.x.size()) << " double\n";
@@ -1728,7 +1740,10 @@ void orderForBisection(Mesh& M, const Scanner& in) {
     bool good = true;
     for (int i = 0; i < 6; ++i) good &= is[i] == due[i] * cube2;  // exact: few binary digits
     for (int n : z)
-      for (double t : {M.xi[n].x, M.xi[n].y, M.xi[n].z}) good &= std::remainder(t, .5 * cube) == 0;
+      for (double t : {M.xi[n].x, M.xi[n].y, M.xi[n].z}) {
+        const double halves = t / (.5 * cube);  // exact
+        good &= halves == std::floor(halves);
+      }
     if (!good)
       in.failAsWhole("the computational coordinates of tetrahedron " + std::to_string(E) +
                      " are not those of a bisected cube at its level " +
