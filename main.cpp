@@ -3454,6 +3454,11 @@ InsertOptions insertOptions(const Arguments& a) {
   return o;
 }
 
+/// PREFIX-name; in a folder, where PREFIX ends in /, the name alone.
+std::string stageFile(const std::string& prefix, char mark, const std::string& name) {
+  return prefix.back() == '/' ? prefix + name : prefix + mark + name;
+}
+
 /// The files of --stages PREFIX. Stages come once for each way of inserting that is tried; those of
 /// the way that was taken are written. With several surfaces their number follows the prefix:
 /// PREFIX-2-projected.vtk.
@@ -3472,11 +3477,12 @@ struct Stages {
 
   void keep(const std::string& name, const Mesh& M, int ofSurface, int ofWay) {
     if (!prefix.empty())
-      kept.push_back({ofSurface, ofWay, {prefix + '-' + name + ".vtk", vtkText(M)}});
+      kept.push_back({ofSurface, ofWay, {stageFile(prefix, '-', name + ".vtk"), vtkText(M)}});
     if (pictures.empty()) return;
     PictureOptions o{cut, Colour::quality, name};
     if (ofSurface == 0) o.line = line;
-    kept.push_back({ofSurface, ofWay, {pictures + '_' + name + ".svg", pictureText(M, o)}});
+    kept.push_back(
+        {ofSurface, ofWay, {stageFile(pictures, '_', name + ".svg"), pictureText(M, o)}});
   }
   void cutAcross(const std::vector<TriangleSurface>& surfaces, const Mesh& M) {
     std::vector<Triangle3> triangles;
@@ -3533,12 +3539,12 @@ void runInsert(const Arguments& a, const Streams& io) {
   InsertOptions options = insertOptions(a);
   const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
   for (const char* stage : {"original", "refined", "projected", "smoothed"})
-    if (!prefix.empty() && path == prefix + "-" + stage + ".vtk")
+    if (!prefix.empty() && path == stageFile(prefix, '-', std::string(stage) + ".vtk"))
       throw UsageError("the mesh and a stage would both be written to " + path);
   checkWritable(path);
-  if (!prefix.empty()) checkWritable(prefix + "-original.vtk");
+  if (!prefix.empty()) checkWritable(stageFile(prefix, '-', "original.vtk"));
   const std::string pictures = a.has("--pictures") ? a.options.at("--pictures")[0] : "";
-  if (!pictures.empty()) checkWritable(pictures + "_original.svg");
+  if (!pictures.empty()) checkWritable(stageFile(pictures, '_', "original.svg"));
   Mesh M = readMesh(a.operands[0]);
   checkInsertable(a.operands[0], M);
   Progress progress(io, a.has("--quiet"));
@@ -3834,7 +3840,7 @@ std::vector<Command> changingCommands() {
         threadsOption,
         {"--stages", "PREFIX",
          "also write PREFIX-{original,refined,projected,smoothed}.vtk (of several surfaces\n"
-         "                       PREFIX-1-refined.vtk, ...)"},
+         "                       PREFIX-1-refined.vtk, ...); a PREFIX that ends in / is a folder"},
         {"--pictures", "PREFIX", "also draw PREFIX_original.svg and so on, as `picture` does"},
         maxTetsOption,
         quietOption},

@@ -1040,6 +1040,8 @@ TEST_SUITE("command line") {
          "'99999999999' is no integer up to 2147483647 for --cells"},
         {{"insert", "m.vtk", "s.obj", "-o", "a-refined.vtk", "--lc", "1", "--stages", "a"},
          "the mesh and a stage would both be written to a-refined.vtk"},
+        {{"insert", "m.vtk", "s.obj", "-o", "./refined.vtk", "--lc", "1", "--stages", "./"},
+         "the mesh and a stage would both be written to ./refined.vtk"},
         {{"convert", "a.vtk", "a.doc"}, "'a.doc' ends neither in .vtk, .msh or .mesh (meshes)"}};
     for (const auto& [words, what] : rules) {
       const Outcome o = call(words);
