@@ -2259,6 +2259,16 @@ void checkMeccano(const Mesh& M, const std::string& who) {
     for (const Corner::Place& place : corner.on)
       if (place.curve < 1 || place.curve > curves)
         refuse("a corner lies on a curve that is not there");
+  for (std::size_t E = 0; E < tets; ++E)  // as where a host has reordered the elements alone
+    for (int i = 0; i < 4; ++i)
+      for (int n : faceOpposite(M.tets[E], i)) {
+        Vec2 u;
+        if (M.faceLabel[E][i] != 0 && !parameterOn(M, n, M.faceLabel[E][i], u))
+          refuse("the face of tetrahedron " + std::to_string(E) + " opposite to its vertex " +
+                 std::to_string(i) + " has label " + std::to_string(M.faceLabel[E][i]) +
+                 ", which its nodes do not lie on; keep faceLabel, type and level in the order of "
+                 "the tetrahedra");
+      }
 }
 
 /// s of node n on curve c.

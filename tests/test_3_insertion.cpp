@@ -666,6 +666,7 @@ TEST_SUITE("3") {
     refused([](Mesh& M) { M.tets[3][2] = -1; }, "tetrahedron 3");
     refused([](Mesh& M) { M.type[5] = 2; }, "tetrahedron 5");
     refused([](Mesh& M) { M.faceLabel[7][0] = 1; }, "tetrahedron 7");
+    refused([](Mesh& M) { std::reverse(M.tets.begin(), M.tets.end()); }, "in the order of the tet");
     refused([](Mesh& M) { M.entity[1] = 77; }, "node 1");
     refused([](Mesh& M) { M.dimension[13] = 9; }, "node 13");
     refused([](Mesh& M) { M.patches.clear(); }, "out of range");
