@@ -1272,8 +1272,8 @@ bool hasDirectedEdge(const std::array<int, 3>& t, int a, int b) {
 
 /// Turns the triangles of S_M all one way: that of 𝓢, where their nodes know their u.
 void orientSheet(const Mesh& M, std::vector<Face>& faces) {
-  std::vector<std::pair<std::pair<int, int>, int>>
-      atEdge;  // an edge and a face that has it, sorted
+  using EdgeOfFace = std::pair<std::pair<int, int>, int>;  // the face's number last
+  std::vector<EdgeOfFace> atEdge;                          // sorted
   for (std::size_t f = 0; f < faces.size(); ++f)
     for (int i = 0; i < 3; ++i)
       atEdge.push_back({std::minmax(faces[f].nodes[i], faces[f].nodes[(i + 1) % 3]), f});
@@ -1288,7 +1288,7 @@ void orientSheet(const Mesh& M, std::vector<Face>& faces) {
       for (int i = 0; i < 3; ++i) {
         const int a = t[i], b = t[(i + 1) % 3];
         const std::pair<int, int> edge = std::minmax(a, b);
-        auto it = std::lower_bound(atEdge.begin(), atEdge.end(), std::pair{edge, 0});
+        auto it = std::lower_bound(atEdge.begin(), atEdge.end(), EdgeOfFace{edge, 0});
         for (; it != atEdge.end() && it->first == edge; ++it) {
           if (seen[it->second]++) continue;
           std::array<int, 3>& other = faces[it->second].nodes;
