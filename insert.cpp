@@ -2252,6 +2252,7 @@ void checkMeccano(const Mesh& M, const std::string& who) {
         std::min({M.xi[n].x, M.xi[n].y, M.xi[n].z}) < 0)
       refuse("node " + std::to_string(n) + " has an entity or a coordinate out of range");
   }
+  checkGeometry(M, who);
   const int curves = counts[1];
   for (const Parametrization& P : M.surfaces)
     if (P.rim < 1 || P.rim > curves) refuse("surface '" + P.name + "' names no curve as its rim");

@@ -3459,6 +3459,23 @@ std::string stageFile(const std::string& prefix, char mark, const std::string& n
   return prefix.back() == '/' ? prefix + name : prefix + mark + name;
 }
 
+/// Whether a file of --stages PREFIX may have this path: PREFIX-original.vtk, PREFIX-2-refined.vtk.
+bool isStage(const std::string& prefix, const std::string& path) {
+  const auto placeOf = [](const std::string& file) {
+    std::error_code none;
+    const fs::path whole = fs::absolute(file, none);
+    return (fs::weakly_canonical(whole.parent_path(), none) / whole.filename()).string();
+  };
+  const std::string last = "original.vtk", first = placeOf(stageFile(prefix, '-', last));
+  const std::size_t begin = first.size() - last.size();
+  const std::string place = placeOf(path);
+  if (place.compare(0, begin, first, 0, begin) != 0) return false;
+  std::string name = place.substr(begin);
+  const std::size_t digits = name.find_first_not_of("0123456789");
+  if (digits > 0 && digits != std::string::npos && name[digits] == '-') name.erase(0, digits + 1);
+  return name == last || name == "refined.vtk" || name == "projected.vtk" || name == "smoothed.vtk";
+}
+
 /// The files of --stages PREFIX. Stages come once for each way of inserting that is tried; those of
 /// the way that was taken are written. With several surfaces their number follows the prefix:
 /// PREFIX-2-projected.vtk.
@@ -3538,9 +3555,11 @@ void runInsert(const Arguments& a, const Streams& io) {
   const std::string path = a.output(1);
   InsertOptions options = insertOptions(a);
   const std::string prefix = a.has("--stages") ? a.options.at("--stages")[0] : "";
-  for (const char* stage : {"original", "refined", "projected", "smoothed"})
-    if (!prefix.empty() && path == stageFile(prefix, '-', std::string(stage) + ".vtk"))
-      throw UsageError("the mesh and a stage would both be written to " + path);
+  if (!prefix.empty() && isStage(prefix, path))
+    throw UsageError("the mesh and a stage would both be written to " + path);
+  for (const std::string& input : a.operands)
+    if (!prefix.empty() && isStage(prefix, input))
+      throw UsageError("'" + input + "' would be read and overwritten; choose another --stages");
   checkWritable(path);
   if (!prefix.empty()) checkWritable(stageFile(prefix, '-', "original.vtk"));
   const std::string pictures = a.has("--pictures") ? a.options.at("--pictures")[0] : "";

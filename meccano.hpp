@@ -477,6 +477,11 @@ Vec3 varphi(const Parametrization& P, const Location& at);
 /// False: not on it.
 bool parameterOn(const Mesh& M, int n, int label, Vec2& u);
 
+/// Refuses surfaces, patches and curves whose arrays do not fit together, before they are followed.
+///   who     the caller's name, for the message
+///   errors  InputError: which one, and what it lacks
+void checkGeometry(const Mesh& M, const std::string& who);
+
 /// The surface or patch with a label as in Mesh::faceLabel.
 const Parametrization& surfaceOf(const Mesh& M, int label);
 /// Faces labelled k, not 0 (S_M of inserted surface k, or boundary patch -k), each once. [faces],

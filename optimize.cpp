@@ -2152,7 +2152,42 @@ void liftWorst(Smoother& S) {
   throw InputError("optimizeMesh (§3.7): " + what);
 }
 
+/// Empty, or what makes the parameterization unfit for locate() and varphi().
+std::string faultOf(const Parametrization& P) {
+  if (P.points.empty() || P.u.size() != P.points.size())
+    return "needs points, and as many parameters u";
+  for (const std::array<int, 3>& t : P.triangles)
+    for (int n : t)
+      if (n < 0 || n >= static_cast<int>(P.points.size())) return "has a triangle out of range";
+  return P.gridSize < 1 ? "has no locator; call buildLocator() first" : "";
+}
+
+/// Empty, or what makes the curve of the mesh unfit for gamma() and curveParameter().
+std::string faultOf(const Curve& C, const Mesh& M) {
+  if (C.points.size() < 2 || C.s.size() != C.points.size() + C.closed)
+    return "needs two points at least, and their arc lengths";
+  if (C.s[0] != 0 || !std::is_sorted(C.s.begin(), C.s.end()) || !(C.s.back() > 0))
+    return "has arc lengths that do not grow from 0";
+  for (const Curve::Side& side : C.sides) {
+    const std::size_t count = side.surface > 0 ? M.surfaces.size() : M.patches.size();
+    const std::size_t index = std::abs(side.surface);
+    if (index < 1 || index > count || side.u.size() != C.points.size())
+      return "has a side without a surface, or without u of each point";
+  }
+  return "";
+}
+
 }  // namespace
+
+void checkGeometry(const Mesh& M, const std::string& who) {
+  const auto refuseAny = [&](const std::string& what, std::size_t i, const std::string& fault) {
+    if (!fault.empty()) throw InputError(who + ": " + what + std::to_string(i + 1) + ' ' + fault);
+  };
+  for (std::size_t k = 0; k < M.surfaces.size(); ++k)
+    refuseAny("surface ", k, faultOf(M.surfaces[k]));
+  for (std::size_t p = 0; p < M.patches.size(); ++p) refuseAny("patch ", p, faultOf(M.patches[p]));
+  for (std::size_t c = 0; c < M.curves.size(); ++c) refuseAny("curve ", c, faultOf(M.curves[c], M));
+}
 
 void checkOptions(const OptimizeOptions& o, std::size_t nodes) {
   const auto demand = [](bool holds, const char* name, double value, const char* range) {
@@ -2191,9 +2226,6 @@ void checkEntity(const Mesh& M, std::size_t n) {
   if (entity == 0 || index > count)
     refuse(at + "no surface or patch " + std::to_string(entity) + " of " + std::to_string(count) +
            "; correct Mesh::entity");
-  if (surfaceOf(M, entity).gridSize < 1)
-    refuse(at + "its surface " + std::to_string(entity) +
-           " has no locator; call buildLocator() first");
 }
 
 /// [choice] Length units: σ² of a mesh as small does not underflow, nor overflow of one as large.
@@ -2231,6 +2263,7 @@ void checkNodes(const Mesh& M) {
   demandSize("M.entity", M.entity.size());
   demandSize("M.parameter", M.parameter.size());
   for (std::size_t n = 0; n < nodes; ++n) checkEntity(M, n);
+  checkGeometry(M, "optimizeMesh (§3.7)");
 }
 
 /// Relative to the cube of its longest edge: below it the inverse of its edges has no correct

@@ -671,6 +671,14 @@ TEST_SUITE("3") {
     refused([](Mesh& M) { M.dimension[13] = 9; }, "node 13");
     refused([](Mesh& M) { M.patches.clear(); }, "out of range");
     refused([](Mesh& M) { M.corners[0].on[0].curve = 13; }, "curve");
+    refused([](Mesh& M) { M.curves[2].points.clear(); }, "curve 3 needs two points");
+    refused([](Mesh& M) { M.curves[3].s.pop_back(); }, "curve 4 needs two points");
+    refused([](Mesh& M) { M.curves[4].s[1] = -1; }, "curve 5 has arc lengths");
+    refused([](Mesh& M) { M.curves[5].sides[0].surface = 1; }, "curve 6 has a side");
+    refused([](Mesh& M) { M.curves[6].sides[1].u.pop_back(); }, "curve 7 has a side");
+    refused([](Mesh& M) { M.patches[1].u.clear(); }, "patch 2 needs points");
+    refused([](Mesh& M) { M.patches[2].triangles[0][1] = 4; }, "patch 3 has a triangle");
+    refused([](Mesh& M) { M.patches[3].gridSize = 0; }, "call buildLocator() first");
     refused([](Mesh& M) { M.x[13].y = HUGE_VAL; }, "node 13");
     refused(
         [](Mesh& M) {

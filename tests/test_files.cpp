@@ -1042,6 +1042,8 @@ TEST_SUITE("command line") {
          "the mesh and a stage would both be written to a-refined.vtk"},
         {{"insert", "m.vtk", "s.obj", "-o", "./refined.vtk", "--lc", "1", "--stages", "./"},
          "the mesh and a stage would both be written to ./refined.vtk"},
+        {{"insert", "m.vtk", "s.obj", "-o", "a-2-refined.vtk", "--lc", "1", "--stages", "./a"},
+         "the mesh and a stage would both be written to a-2-refined.vtk"},
         {{"convert", "a.vtk", "a.doc"}, "'a.doc' ends neither in .vtk, .msh or .mesh (meshes)"}};
     for (const auto& [words, what] : rules) {
       const Outcome o = call(words);
@@ -1055,13 +1057,18 @@ TEST_SUITE("command line") {
     const std::string mesh = folder / "m.vtk", other = folder / "other.vtk";
     REQUIRE(call({"box", "-o", mesh}).status == 0);
     fs::copy_file(mesh, other);
-    const std::vector<std::vector<std::string>> wrong{
+    std::vector<std::vector<std::string>> wrong{
         {"insert", mesh, other, "-o", other},
         {"insert", mesh, other, "-o", folder / "./other.vtk"},
         {"solid", other, "--eps", "1", "-o", other},
         {"solid", mesh, "--eps", "1", "--polycube", other, "-o", other},
         {"terrain", other, "--top", "1", "-o", other},
         {"optimize", mesh, "--ideal", other, "-o", other}};
+    const std::string prefix = folder / "s", out = folder / "out.vtk";
+    for (const char* stage : {"s-original.vtk", "./s-12-projected.vtk", "s-3-smoothed.vtk"}) {
+      const std::string read = folder / stage;
+      wrong.push_back({"insert", read, other, "-o", out, "--stages", prefix});
+    }
     for (const std::vector<std::string>& words : wrong) {
       const Outcome o = call(words);
       CHECK(o.status == 2);
