@@ -49,39 +49,38 @@ class KeyMap {
   explicit KeyMap(std::size_t expected = 8) {
     std::size_t size = 16;
     while (size < 2 * expected) size *= 2;
-    keys_.assign(size, empty);
-    values_.assign(size, 0);
+    slots_.assign(size, {empty, 0});
   }
   int& operator[](std::uint64_t key) {
-    if (2 * (count_ + 1) > keys_.size()) grow();
-    const std::size_t i = slot(key);
-    if (keys_[i] == empty) {
-      keys_[i] = key;
+    if (2 * (count_ + 1) > slots_.size()) grow();
+    Slot& s = slots_[slot(key)];
+    if (s.key == empty) {
+      s.key = key;
       ++count_;
     }
-    return values_[i];
+    return s.value;
   }
-  int get(std::uint64_t key) const {
-    const std::size_t i = slot(key);
-    return keys_[i] == empty ? 0 : values_[i];
-  }
+  int get(std::uint64_t key) const { return slots_[slot(key)].value; }
 
  private:
   static constexpr std::uint64_t empty = ~std::uint64_t(0);
+  struct Slot {
+    std::uint64_t key;
+    int value;  // 0 where empty
+  };
   std::size_t slot(std::uint64_t key) const {
     std::uint64_t z = key * 0x9E3779B97F4A7C15u;  // Fibonacci hashing
-    std::size_t i = (z ^ (z >> 29)) & (keys_.size() - 1);
-    while (keys_[i] != empty && keys_[i] != key) i = (i + 1) & (keys_.size() - 1);
+    std::size_t i = (z ^ (z >> 29)) & (slots_.size() - 1);
+    while (slots_[i].key != empty && slots_[i].key != key) i = (i + 1) & (slots_.size() - 1);
     return i;
   }
   void grow() {
-    KeyMap larger(keys_.size());
-    for (std::size_t i = 0; i < keys_.size(); ++i)
-      if (keys_[i] != empty) larger[keys_[i]] = values_[i];
+    KeyMap larger(slots_.size());
+    for (const Slot& s : slots_)
+      if (s.key != empty) larger[s.key] = s.value;
     *this = std::move(larger);
   }
-  std::vector<std::uint64_t> keys_;
-  std::vector<int> values_;
+  std::vector<Slot> slots_;
   std::size_t count_ = 0;
 };
 
@@ -4952,10 +4951,12 @@ void addCubesInCone(const Mesh& M, std::array<int, 4> z, int i, const Lattice& l
   const Mat3 toEdges = inverse(edges);
   const double half = .5 / lattice.scale;
   const Vec3 a = half * toEdges.c0, b = half * toEdges.c1, c = half * toEdges.c2;
-  for (int corner = 0; corner < 8; ++corner) {  // the centre is at (±half, ±half, ±half)
-    const Vec3 w = (corner & 1 ? a : -a) + (corner & 2 ? b : -b) + (corner & 4 ? c : -c);
+  for (int corner = 0; corner < 4; ++corner) {  // the centre is at (±half, ±half, ±half)
+    const Vec3 w = (corner & 1 ? a : -a) + (corner & 2 ? b : -b) - c;
     if (w.x >= 0 && w.y >= 0 && w.z >= 0)
       cubes.add(cornerOf(lattice.node(at), corner), x + images * w);
+    if (w.x <= 0 && w.y <= 0 && w.z <= 0)  // the opposite corner
+      cubes.add(cornerOf(lattice.node(at), 7 - corner), x - images * w);
   }
 }
 
