@@ -2222,8 +2222,7 @@ void checkMeccano(const Mesh& M, const std::string& who) {
   if (M.xi.size() != nodes)
     refuse(
         "the mesh has no computational coordinates, which bisection and projection need; make it "
-        "by "
-        "boxMesh or `meccano box`, or read a meccano .vtk");
+        "by boxMesh or `meccano box`, or read a meccano .vtk");
   if (M.type.size() != tets || M.level.size() != tets || M.faceLabel.size() != tets ||
       M.dimension.size() != nodes || M.entity.size() != nodes || M.parameter.size() != nodes)
     refuse(
@@ -4477,8 +4476,8 @@ class FacePlanes {
 
 /// Whether a triangle meets the tetrahedron: what is left of it when clipped by the four planes.
 bool meets(const FacePlanes& planes, const std::array<Vec3, 3>& triangle) {
-  constexpr double tolerance =
-      1e-9;  // relative to the tetrahedron: closed, an extra hit is harmless
+  // relative to the tetrahedron: closed, an extra hit is harmless
+  constexpr double tolerance = 1e-9;
   // mostly the corners tell: one inside all planes, or all three beyond one
   bool inside[3] = {true, true, true};
   for (int i = 0; i < 4; ++i) {
@@ -5473,8 +5472,7 @@ bool cutPinches(const SquareSurface& Q, Selection& selected) {
 /// [§3.4] The squares with all nodes on one side of S; one disk. [departure] Whole squares, where
 /// the paper selects triangles: S_M is then bounded by lattice edges, as §3.5 takes for granted.
 Selection selectSquares(const SquareSurface& Q, const Survey& survey, int side) {
-  constexpr double maxExcess =
-      .75;  // [choice] of h: squares farther beyond the rim are no candidates
+  constexpr double maxExcess = .75;  // [choice] of h: squares farther beyond the rim are out
   constexpr int maxRounds = 100;
   Selection selected(Q.squares.size(), emptySquare);
   for (std::size_t i = 0; i < Q.squares.size(); ++i) {
@@ -6421,8 +6419,8 @@ int middleOfLongestArc(const std::vector<double>& s, std::vector<int> chosen) {
 }  // namespace
 
 void splitChords(TriangleSurface& S) {
-  constexpr int maxRounds =
-      64;  // a chord's new point is inside: one round, two where the rim had three points
+  // a chord's new point is inside: one round, two where the rim had three points
+  constexpr int maxRounds = 64;
   for (int round = 0; round < maxRounds && splitChordsOnce(S) > 0; ++round) {
   }
 }

@@ -1340,8 +1340,8 @@ void SheetBarrier::addTo(Objective& o) const {
 /// of 1e-8 by truncation and by cancellation.
 constexpr double differenceStep = 1e-4;
 
-constexpr int rejectedSteps =
-    3;  // OptimizeOptions::accept is asked for so many, each half the last
+/// OptimizeOptions::accept is asked for so many steps, each half the last.
+constexpr int rejectedSteps = 3;
 
 /// [§3.7.3, eq. (10), (11)] A surface or curve node: a Newton step in its parameters. Returns the
 /// displacement.

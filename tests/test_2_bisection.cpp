@@ -327,8 +327,8 @@ TEST_SUITE("2") {
       "bisection: a new node is the exact midpoint of its edge, also in a box off the origin") {
     Mesh M = boxMesh({.1, -.3, 7}, {.7, 1.1, .9}, {1, 1, 1});
     Dice dice(15);
-    int found =
-        0;  // new nodes on edges of the mesh before; the closure splits edges of its own, too
+    // new nodes on edges of the mesh before; the closure splits edges of its own, too
+    int found = 0;
     for (int i = 0; i < 200; ++i) {
       const Mesh before = M;
       bisect(M, {dice.below(M.tets.size())});
