@@ -3200,6 +3200,12 @@ struct Arguments {
     if (!std::isfinite(double(value))) throw UsageError(std::string(name) + " must be finite");
     return value;
   }
+  /// A length; refuses 0 and less.
+  double length(const char* name, double otherwise) const {
+    const double value = number(name, otherwise);
+    if (has(name) && !(value > 0)) fail(name + (' ' + options.at(name)[0]) + " must be above 0");
+    return value;
+  }
   Vec3 vec3(const char* name, Vec3 otherwise) const {
     return {number(name, otherwise.x, 0), number(name, otherwise.y, 1),
             number(name, otherwise.z, 2)};
@@ -3333,18 +3339,15 @@ void printMesher(const MesherReport& r, const Streams& io) {
 
 MesherOptions mesherOptions(const Arguments& a, Progress& progress) {
   MesherOptions o;
-  o.eps = a.number("--eps", o.eps);
+  o.eps = a.length("--eps", o.eps);
   o.maxTets = a.number("--max-tets", o.maxTets);
   o.fixedBoundary = a.has("--fixed-boundary");
   o.optimize.power = a.number("--power", o.optimize.power);
   o.optimize.threads = a.number("--threads", 0);
+  checkOptions(o.optimize, 0);
   o.onProgress = [&progress](const std::string& line) { progress.line(line); };
   o.optimize.onSweep = progress.sweeps();
   return o;
-}
-
-void checkEps(const Arguments& a) {
-  if (!(a.number("--eps", 0.) > 0)) fail("--eps " + a.options.at("--eps")[0] + " must be above 0");
 }
 
 /// Writes a mesh of Algorithm 1 and prints its report.
@@ -3362,7 +3365,6 @@ void runTerrain(const Arguments& a, const Streams& io) {
   if (!a.has("--top")) throw UsageError("the height of the top is missing: --top Z");
   Progress progress(io, a.has("--quiet"));
   MesherOptions options = mesherOptions(a, progress);
-  if (a.has("--eps")) checkEps(a);
   checkWritable(path);
   Terrain T = readTerrain(a.operands[0]);
   T.top = a.number("--top", 0.);
@@ -3387,7 +3389,6 @@ void runSolid(const Arguments& a, const Streams& io) {
   if (!a.has("--eps")) throw UsageError("the precision is missing: --eps E");
   Progress progress(io, a.has("--quiet"));
   MesherOptions options = mesherOptions(a, progress);
-  checkEps(a);
   checkWritable(path);
   std::vector<std::string> warnings;
   const std::vector<TriangleSurface> all = readSurfaces(a.operands[0], warnings);
@@ -3443,14 +3444,12 @@ InsertOptions insertOptions(const Arguments& a) {
   InsertOptions o = a.has("--paper") ? InsertOptions::paper() : InsertOptions{};
   if (a.has("--lc") && a.has("--tolerance"))
     throw UsageError("--lc and --tolerance both choose the size; give one of them, or none");
-  for (const char* length : {"--lc", "--tolerance"})
-    if (a.has(length) && !(a.number(length, 0.) > 0))
-      fail(std::string("insert: ") + length + " " + a.options.at(length)[0] + " must be above 0");
-  o.lc = a.number("--lc", o.lc);
-  o.tolerance = a.number("--tolerance", o.tolerance);
+  o.lc = a.length("--lc", o.lc);
+  o.tolerance = a.length("--tolerance", o.tolerance);
   o.maxTets = a.number("--max-tets", o.maxTets);
   o.optimize.power = a.number("--power", o.optimize.power);
   o.optimize.threads = a.number("--threads", 0);
+  checkOptions(o.optimize, 0);
   return o;
 }
 
@@ -3593,6 +3592,7 @@ OptimizeOptions optimizeOptions(const Arguments& a) {
   o.maxSweeps = a.number("--max-sweeps", o.maxSweeps);
   o.power = a.number("--power", o.power);
   o.threads = a.number("--threads", 0);
+  checkOptions(o, 0);
   return o;
 }
 

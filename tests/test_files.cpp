@@ -1052,6 +1052,21 @@ TEST_SUITE("command line") {
     }
   }
 
+  TEST_CASE("options out of range are told before a file is read") {
+    const std::vector<std::pair<std::vector<std::string>, std::string>> wrong{
+        {{"insert", "none.vtk", "none.obj", "-o", "a.vtk", "--lc", "-1"}, "--lc -1 must be above"},
+        {{"insert", "none.vtk", "none.obj", "-o", "a.vtk", "--tolerance", "0"}, "--tolerance 0"},
+        {{"insert", "none.vtk", "none.obj", "-o", "a.vtk", "--power", "65"}, "power = 65"},
+        {{"solid", "none.obj", "-o", "a.vtk", "--eps", "0"}, "--eps 0 must be above 0"},
+        {{"terrain", "none.asc", "-o", "a.vtk", "--top", "9", "--threads", "-1"}, "threads = -1"},
+        {{"optimize", "none.vtk", "-o", "a.vtk", "--max-sweeps", "0"}, "maxSweeps = 0"}};
+    for (const auto& [words, what] : wrong) {
+      const Outcome o = call(words);
+      CHECK(o.status == 1);
+      CHECK_MESSAGE(has(o.err, what), o.err);
+    }
+  }
+
   TEST_CASE("what is read, but for the mesh that is changed, is not overwritten") {
     Folder folder;
     const std::string mesh = folder / "m.vtk", other = folder / "other.vtk";
