@@ -4777,11 +4777,15 @@ int chi(unsigned cubes) {
 }
 
 bool isFaceConnected(unsigned cubes) {
+  const auto acrossFaces = [](unsigned c) {  // x, y and z flip bits 0, 1 and 2 of a cube's place
+    return (c & 0x55) << 1 | (c & 0xaa) >> 1 | (c & 0x33) << 2 | (c & 0xcc) >> 2 | (c & 0x0f) << 4 |
+           (c & 0xf0) >> 4;
+  };
   unsigned reached = cubes & -cubes;
-  for (int round = 0; round < 8; ++round)
-    for (int c = 0; c < 8; ++c)
-      for (int axis = 0; axis < 3; ++axis)
-        if ((reached >> c & 1) && (cubes >> (c ^ 1 << axis) & 1)) reached |= 1u << (c ^ 1 << axis);
+  for (unsigned last = 0; last != reached;) {
+    last = reached;
+    reached |= acrossFaces(reached) & cubes;
+  }
   return reached == cubes;
 }
 
